@@ -10,7 +10,7 @@ TORCH := torch==2.13.0
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-fast test-slow test-all test-fuzz test-random lint docs dist bench-gpu check-python clean
+.PHONY: help demo test test-fast test-slow test-all test-fuzz test-random mutants lint docs dist bench-gpu check-python clean
 
 help:
 	@echo "make demo         run the whole chain on the bundled scene, up to 11 minutes"
@@ -19,6 +19,7 @@ help:
 	@echo "make test-all     the slow ones too, at most 40 minutes"
 	@echo "make test-fuzz    100,000 damaged files of each format, hours; others each day"
 	@echo "make test-random  formats and geometry on other examples each time"
+	@echo "make mutants      change the code 400 times and count what the tests notice, hours"
 	@echo "make lint         check format, lint and types"
 	@echo "make docs         build the documentation's site in build/docs"
 	@echo "make bench-gpu    measure on an NVIDIA GPU, within 10 minutes, into bench/results"
@@ -48,6 +49,10 @@ test-fuzz: $(VENV)/.installed-test
 
 test-random: $(VENV)/.installed-test
 	$(PYTEST) -m hypothesis --hypothesis-profile random
+
+# Others by count, seed and parts: make mutants MUTANTS="--count 20 --seed 3 --parts attack"
+mutants: $(VENV)/.installed-test
+	PYTHONPATH=tests $(VENV)/bin/python -m mutants.run $(MUTANTS)
 
 lint: $(VENV)/.installed-dev
 	$(VENV)/bin/ruff format --check .

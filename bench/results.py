@@ -1,4 +1,4 @@
-"""What is said about the machine, and where results are written."""
+"""How far a benchmark is, what is said about the machine, and where results go."""
 
 from __future__ import annotations
 
@@ -6,16 +6,95 @@ import datetime
 import importlib.metadata
 import platform
 import re
+import shlex
+import subprocess
 import sys
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
+import tyro
+
+from mi_nerfattack import variant
 from mi_nerfattack.backend import llvm
+from mi_nerfattack.commands.shared.options import check_positive, command_line
+from mi_nerfattack.commands.shared.progress import StageBars
+from mi_nerfattack.commands.shared.terminal import Result
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
-from mi_nerfattack.system.cores import cores
+from mi_nerfattack.system.machine import cores
 
 PACKAGES = ("mi-nerfattack", "mitsuba", "drjit", "torch", "numpy")
+#: Called with a stage's name, units done and wanted, and a remark.
+Progress = Callable[[str, int, int, str], None]
+
+
+@contextmanager
+def progress() -> Iterator[Progress]:
+    """Show how far a benchmark is."""
+    with StageBars() as bars:
+
+        def show(stage: str, done: int, total: int, remark: str) -> None:
+            bars.show(stage, done, total, f"{done}/{total} {remark}")
+
+        yield show
+
+
+def read_sizes(texts: Sequence[str]) -> tuple[tuple[int, int], ...]:
+    """Read widths and heights as in 200x66."""
+    sizes = []
+    for text in texts:
+        width, cross, height = text.partition("x")
+        if not (cross and width.isdecimal() and height.isdecimal()):
+            raise InputError(f"--sizes: {text!r}; expected WIDTHxHEIGHT as in 200x66")
+        if not (8 <= int(width) <= 4096 and 8 <= int(height) <= 4096):
+            raise InputError(f"--sizes: {text!r}; allowed are 8 to 4096 pixels")
+        sizes.append((int(width), int(height)))
+    if not sizes:
+        raise InputError("--sizes: none given; expected WIDTHxHEIGHT as in 200x66")
+    return tuple(sizes)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What commands take that measure two sides in turns."""
+
+    repeats: int = 5
+    """Turns of each side."""
+    quick: bool = False
+    """Measure next to nothing: to see that it works, not for figures."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Also write the result with machine, versions and date: a .json file, or a folder
+    in which it is named by date and machine."""
+    json: bool = False
+    """Print one line of JSON in place of the table."""
+
+
+_Options = TypeVar("_Options", bound=Comparison)
+
+
+def compare(
+    name: str,
+    options: _Options,
+    measure: Callable[[_Options, Path, Progress], dict[str, Any]],
+    lines: Callable[[dict[str, Any]], list[str]],
+) -> Result:
+    """Measure, write if `options.output` says where, and print.
+
+    Args:
+        name: of the command.
+        options: of it.
+        measure: returns the document, but for its stamp; may write into the folder.
+        lines: returns the table of a document, and the lines below it.
+    """
+    check_positive(options, "repeats")
+    variant.ensure()
+    with progress() as show, tempfile.TemporaryDirectory() as folder:
+        document = publish(name, options, measure(options, Path(folder), show))
+    return Result(document, lambda: print(*lines(document), sep="\n"))
 
 
 def machine() -> dict[str, Any]:
@@ -36,7 +115,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def stamp(document: dict[str, Any], command: Sequence[str]) -> dict[str, Any]:
+def stamp(document: dict[str, Any], command: str) -> dict[str, Any]:
     """Add date, machine, versions and command to a document."""
     now = datetime.datetime.now(datetime.timezone.utc)
     return {
@@ -44,35 +123,24 @@ def stamp(document: dict[str, Any], command: Sequence[str]) -> dict[str, Any]:
         "date": now.date().isoformat(),
         "machine": machine(),
         "versions": versions(),
-        "command": " ".join(command),
+        "command": command,
     }
 
 
-def summary_of(sweep: Path) -> dict[str, Any]:
-    """Return what a sweep, finished or not, or a copy of its table came to."""
-    from mi_nerfattack.experiment.sweep.cell import CELLS
-    from mi_nerfattack.experiment.sweep.summary import (
-        SUMMARY,
-        read_attacks,
-        summarise,
-    )
-    from mi_nerfattack.experiment.sweep.table import RESULTS, read_table
-
-    if (sweep / SUMMARY).is_file() and not (sweep / CELLS).is_dir():
-        return files.read_json(sweep / SUMMARY)
-    rows = read_table(sweep / RESULTS)
-    return summarise(rows, read_attacks(sweep, rows))
+def command_of(name: str, options: Any) -> str:
+    """Write a benchmark's command: options but for the defaults and the output."""
+    where = {f.name: f.default for f in fields(options) if f.name in ("output", "json")}
+    line = command_line(name, replace(options, **where))
+    return line.replace("mi-nerfattack", "python -m bench", 1)
 
 
-def copy_files(names: Sequence[str], folder: Path, output: Path) -> None:
-    """Copy files, such as a sweep's table, unless they are there already."""
-    from mi_nerfattack.experiment.sweep.table import MAX_TABLE_BYTES
-
-    files.make_folder(output)
-    if output.resolve() != folder.resolve():
-        for name in names:
-            raw = files.read_bytes(folder / name, MAX_TABLE_BYTES)
-            files.write_bytes(output / name, raw)
+def publish(name: str, options: Any, document: dict[str, Any]) -> dict[str, Any]:
+    """Return a result with its stamp, and write it if `options.output` says where."""
+    document = stamp(document, command_of(name, options))
+    if options.output is not None:
+        path = write(options.output, name, document)
+        print(f"written to {path}", file=sys.stderr)
+    return document
 
 
 def write(target: Path, name: str, document: dict[str, Any]) -> Path:
@@ -103,3 +171,15 @@ def _cpu() -> str:
         if match:
             return match[1].strip()
     return platform.processor() or platform.machine()
+
+
+def run_command(words: Sequence[str]) -> None:
+    """Run ``mi-nerfattack`` in a process of its own.
+
+    Raises:
+        SystemExit: with its exit code, if it fails.
+    """
+    print("$", shlex.join(["mi-nerfattack", *words]), flush=True)
+    command = [sys.executable, "-m", "mi_nerfattack.cli", *words]
+    if code := subprocess.run(command, check=False).returncode:
+        raise SystemExit(code if code > 0 else 1)

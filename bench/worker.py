@@ -9,139 +9,129 @@ largest memory of a process is that of one side alone.
 
 from __future__ import annotations
 
+import importlib
 import json
+import os
+import statistics
+import subprocess
 import sys
-from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-from bench.attack.sides import AbstractAttack
-from bench.full_ngp import NGPData
-from bench.render.sides import AbstractSide, AbstractTrainer
+import torch
+
 from mi_nerfattack import variant
+from mi_nerfattack.errors import NerfAttackError
+from mi_nerfattack.system.machine import cores, peak_memory_mb
 
-if TYPE_CHECKING:
-    from bench.loop.ways import AbstractLoop
+PAUSE_S = 0.3  # until PyTorch's threads have stopped spinning
 
 
-def main(arguments: Sequence[str]) -> None:
-    """Serve one side until stdin ends.
+class Worker:
+    """A side in a process; on a GPU where a `cuda_*` variant is chosen.
 
     Args:
-        arguments: ``fit`` and what :func:`make_trainer` takes; ``attack`` and what
-            :func:`make_attack` takes; ``loop`` and what :func:`make_loop` takes; or
-            role, width, height,
-            and what the role needs: the field's file (``ours``, ``plain``,
-            ``tuned``), samples per ray (``slab``), nothing (``object``); then, for the
-            peers, sizes of chunks.
+        module: of the side, under `bench`; a module called ``peer`` is in PyTorch.
+        side: name of its class, or of a function that makes it.
+        arguments: of that, as JSON has them.
     """
-    side: Any
-    if arguments[0] == "fit":
-        side = make_trainer(*arguments[1:])
-    elif arguments[0] == "attack":
-        side = make_attack(*arguments[1:])
-    elif arguments[0] == "loop":
-        side = make_loop(*arguments[1:])
+
+    def __init__(self, module: str, side: str, *arguments: Any) -> None:
+        self.name = f"{module}.{side}"
+        words = [module, side, json.dumps(arguments)]
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "bench.worker", *words],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def __enter__(self) -> Worker:
+        self._answer()
+        return self
+
+    def __exit__(self, *reason: object) -> None:
+        self.process.kill()
+        self.process.communicate()
+
+    def ask(self, question: str, *arguments: Any) -> Any:
+        """Call a method of the side, and wait for the answer."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(json.dumps([question, *arguments]) + "\n")
+        self.process.stdin.flush()
+        return self._answer()
+
+    def timed(self, question: str, *arguments: Any) -> Any:
+        """Ask when the threads of other sides have stopped spinning."""
+        time.sleep(PAUSE_S)
+        return self.ask(question, *arguments)
+
+    def _answer(self) -> Any:
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        if not line:
+            self.process.communicate()
+            raise NerfAttackError(
+                f"bench: the process '{self.name}' ended with exit code "
+                f"{self.process.returncode}; its message is above"
+            )
+        return json.loads(line)
+
+
+class Clock:
+    """Measures from where it is made."""
+
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    def per_step(self, count: int = 1) -> dict[str, float]:
+        """Return ``seconds`` of time and of all cores' work, one of `count` parts."""
+        return {
+            "seconds": (time.perf_counter() - self._wall) / count,
+            "cpu_seconds": (time.process_time() - self._cpu) / count,
+        }
+
+
+def medians(turns: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Return the median of each figure over turns."""
+    return {key: statistics.median(turn[key] for turn in turns) for key in turns[0]}
+
+
+def memory() -> dict[str, float]:
+    """Return the largest resident size of this process so far, MB.
+
+    On a GPU also what PyTorch's tensors took of it at most.
+    """
+    found = {"peak_memory_mb": peak_memory_mb()}
+    if torch.get_default_device().type == "cuda":
+        found["gpu_memory_mb"] = torch.cuda.max_memory_allocated() / 1e6
+    return found
+
+
+def wait() -> None:
+    """Wait until all that PyTorch asked of the GPU is done; without one, at once."""
+    if torch.get_default_device().type == "cuda":
+        torch.cuda.synchronize()
+
+
+def _serve(module: str, side: str, arguments: str) -> None:
+    """Serve one side until stdin ends."""
+    if module.endswith("peer"):
+        torch.set_num_threads(cores())
+        if os.environ.get(variant.VARIABLE, variant.DEFAULT).startswith("cuda"):
+            torch.set_default_device("cuda")
     else:
-        role, width, height, *rest = arguments
-        side = make_side(role, int(width), int(height), rest)
+        variant.ensure()
+        torch.set_num_threads(1)  # as the commands do: more would wait spinning
+    make = getattr(importlib.import_module(f"bench.{module}"), side)
+    one = make(*json.loads(arguments))
     print(json.dumps("ready"), flush=True)
     for line in sys.stdin:
         question, *given = json.loads(line)
-        print(json.dumps(getattr(side, question)(*given)), flush=True)
-
-
-def make_side(role: str, width: int, height: int, rest: list[str]) -> AbstractSide:
-    """Make a side; imports only what it needs."""
-    if role in ("plain", "tuned"):
-        from bench.render.peer import CHUNKS, TorchSide
-        from bench.torch import device
-
-        device.choose()
-        chunks = tuple(int(size) for size in rest[1:]) or CHUNKS
-        data = NGPData.read(Path(rest[0]))
-        return TorchSide(role, data, width, height, chunks)
-    variant.ensure()
-    from bench.render import ours
-
-    if role == "object":
-        return ours.object_side(width, height)
-    if role == "slab":
-        return ours.slab_side(width, height, int(rest[0]))
-    return ours.scene_side(NGPData.read(Path(rest[0])), width, height)
-
-
-def make_trainer(role: str, start: str, *rest: str) -> AbstractTrainer:
-    """Make a side of a comparison of training steps; imports only what it needs.
-
-    Args:
-        role: ``ours``, ``plain`` or ``tuned``.
-        start: for ours, the file of what is fitted; for a peer, the field's file.
-        rest: for a peer, the file of the pictures, rays a step, and, to try nothing
-            else, the rays of a chunk.
-    """
-    if role in ("plain", "tuned"):
-        from bench.fit.peer import TorchTrainer
-        from bench.torch import device
-
-        device.choose()
-        pictures, rays, *chunk = rest
-        return TorchTrainer(
-            role, Path(start), Path(pictures), int(rays), *map(int, chunk)
-        )
-    variant.ensure()
-    from bench.fit.ours import OurTrainer
-
-    return OurTrainer(Path(start))
-
-
-def make_attack(role: str, *rest: str) -> AbstractAttack:
-    """Make a side of a comparison of attack iterations; imports only what it needs.
-
-    Args:
-        role: ``ours``, ``plain``, ``tuned`` or ``baked``.
-        rest: width, height, poses, horizon and objects; for ours, also the file of the
-            bricks, if they are asked for; for a peer, the files of the background and
-            of the object, and, to try nothing else, the rays of a chunk and the
-            object's lookup.
-    """
-    from bench.attack.drive import Job
-
-    job, others = Job(*map(int, rest[:5])), rest[5:]
-    if role != "ours":
-        from bench.attack.peer import LOOKUPS, TorchAttack
-        from bench.render.peer import CHUNKS
-        from bench.torch import device
-
-        device.choose()
-        scene, item, *choices = others
-        chunks = (int(choices[0]),) if choices else CHUNKS
-        lookups = (choices[1],) if choices else tuple(LOOKUPS)
-        return TorchAttack(role, Path(scene), Path(item), job, chunks, lookups)
-    variant.ensure()
-    from bench.attack.ours import OurAttack
-
-    return OurAttack(job, *map(Path, others))
-
-
-def make_loop(way: str, policy: str, width: str, height: str) -> AbstractLoop:
-    """Make a side of `bench loop`.
-
-    Args:
-        way: ``replay``, ``kept_backgrounds`` or ``plain``.
-        policy: ``torch`` or ``drjit``, the library of the policy.
-        width: of the image, pixels.
-        height: of the image, pixels.
-    """
-    variant.ensure()
-    from bench.loop.ways import PlainLoop, RolloutLoop
-    from mi_nerfattack.rollout.adjoint import KeptBackgrounds, Replay
-
-    if way == "plain":
-        return PlainLoop(policy, int(width), int(height))
-    adjoint = Replay() if way == "replay" else KeptBackgrounds()
-    return RolloutLoop(adjoint, policy, int(width), int(height))
+        ask = memory if question == "memory" else getattr(one, question)
+        print(json.dumps(ask(*given)), flush=True)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    _serve(*sys.argv[1:])

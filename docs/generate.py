@@ -2,7 +2,8 @@
 
     python docs/generate.py
 
-docs/examples.md shows files of docs/examples/. docs/plugin_reference.md shows the class
+docs/examples.md shows files of docs/examples/. docs/faults.md shows the tables of the
+suite in tests/faults. docs/plugin_reference.md shows the class
 docstrings of plugins/*.py, which are reStructuredText in the format of Mitsuba's plugin
 reference. No plugin is imported. tests/docs/test_generated.py compares the pages with
 the files.
@@ -13,6 +14,7 @@ from __future__ import annotations
 import ast
 import inspect
 import re
+import runpy
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -45,11 +47,39 @@ PROLOG = "\n".join(
 def pages() -> dict[Path, str]:
     """Return the text that each of the pages should have."""
     examples, reference = DOCS / "examples.md", DOCS / "plugin_reference.md"
+    faults = DOCS / "faults.md"
     head = reference.read_text("utf-8").partition(MARK)[0]
     return {
         examples: with_files(examples.read_text("utf-8")),
+        faults: faults.read_text("utf-8").partition(MARK)[0] + MARK + fault_tables(),
         reference: head + MARK + "\n" + plugin_reference(),
     }
+
+
+def fault_tables() -> str:
+    """Write the tables of the conformance suite: events, commands, and their files."""
+    path = DOCS.parent / "tests/faults/jobs.py"
+    suite = runpy.run_path(str(path), run_name="jobs")
+    rows = ["", "| event | exit code | the message holds |", "|---|---|---|"]
+    for name, event in suite["EVENTS"].items():
+        code = "–" if event.code is None else event.code
+        rows.append(f"| {name} | {code} | {event.message or '–'} |")
+    columns = (
+        "command",
+        "files that are written once",
+        "files that end equal to the bit",
+    )
+    rows += ["", f"| {' | '.join(columns)} |", "|---|---|---|"]
+    for name, job in suite["JOBS"].items():
+        once = f"`{job.keeps}`" if job.keeps else "–"
+        equal = " ".join(f"`{pattern}`" for pattern in job.equal)
+        rows.append(f"| `{name}` | {once} | {equal} |")
+    rows += [
+        "",
+        "Commands that write only at their ends, as the suite starts them:",
+        "",
+    ]
+    return "\n".join([*rows, *(f"- `{words}`" for words in suite["WRITERS"]), ""])
 
 
 def with_files(page: str) -> str:

@@ -16,8 +16,10 @@ from .deploy import make_environment as make_environment
 from .errors import InputError as InputError
 from .errors import NerfAttackError as NerfAttackError
 from .errors import SetupError as SetupError
+from .evaluation.summary import summary as summary
 from .experiment import Run as Run
 from .experiment import attack_policy as attack_policy
+from .experiment.sweep.sweep import sweep as sweep
 from .fields import load_field as load_field
 from .policy import CallablePolicy as CallablePolicy
 from .policy import DrJitNetwork as DrJitNetwork

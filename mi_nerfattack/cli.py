@@ -7,6 +7,7 @@ Exit codes: 0 done, 1 a command's own negative answer, 2 usage or input,
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import difflib
 import errno
 import inspect
@@ -18,17 +19,18 @@ import textwrap
 import traceback
 from collections.abc import Mapping, Sequence
 from functools import reduce
-from typing import Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
+import docstring_parser
 import tyro
 
 import mi_nerfattack
 from mi_nerfattack.backend.interrupts import raised_interrupts
 from mi_nerfattack.commands import THEMES, Command, Commands, Group, each, flat
-from mi_nerfattack.commands.shared.result import stdout_to_stderr
+from mi_nerfattack.commands.shared.terminal import stdout_to_stderr
 from mi_nerfattack.errors import InputError, NerfAttackError, is_interrupt
 
-PROG = "mi-nerfattack"
+PROG, PACKAGE = "mi-nerfattack", "mi_nerfattack"
 EXIT_INPUT = 2
 EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
@@ -73,6 +75,13 @@ def main(
     except BrokenPipeError:
         _drop_output()
         return EXIT_BROKEN_PIPE
+    except ModuleNotFoundError as err:
+        if (err.name or PACKAGE).startswith(PACKAGE):
+            raise
+        advice = f"pip install {PROG}, without --no-deps, installs what it lacks"
+        return _fail(
+            f"error: {err.name}: is not installed; {advice}", EXIT_INPUT, debug
+        )
     except OSError as err:
         if err.filename is not None:  # no name of a file, as one that is too long
             return _fail(
@@ -113,7 +122,9 @@ def _run(arguments: list[str], themes: Mapping[str, Commands], prog: str) -> int
         print(_overview(themes, about, level), file=sys.stdout if rest else sys.stderr)
         return 0 if rest else EXIT_INPUT
     try:
-        command = tyro.cli(_one_of(commands), prog=prog, args=arguments, config=_STYLE)
+        with _FIELDS:
+            kinds = _one_of(commands)
+            command = tyro.cli(kinds, prog=prog, args=arguments, config=_STYLE)
     except SystemExit as stop:  # help printed, or wrong usage reported
         code = stop.code or 0
         return code if isinstance(code, int) else EXIT_INPUT
@@ -130,6 +141,50 @@ def _run(arguments: list[str], themes: Mapping[str, Commands], prog: str) -> int
         words = shlex.join([word for word in arguments if word not in anew])
         again = f"{prog} {words}"
         raise _Interrupted(f"; to go on, give it again:\n{again}") from err
+
+
+#: What all options of a name have in common, and their help where a command has none.
+_ALIKE: Mapping[str, Any] = {
+    "output": {"aliases": ["-o"]},
+    "run_folder": {"metavar": "RUN"},
+}
+_TEXTS = {
+    "json": "End with one line of JSON instead of sentences.",
+    "run_folder": "Folder of a finished run of attack.",
+}
+_FIELDS = tyro.constructors.ConstructorRegistry()
+
+
+@_FIELDS.struct_rule
+def _fields(
+    info: tyro.constructors.StructTypeInfo,
+) -> tyro.constructors.StructConstructorSpec | None:
+    """Show each option of a command as a paragraph, and no default of None or False."""
+    kind, given = info.type, info.default
+    if not getattr(kind, "__module__", "").startswith("mi_nerfattack.commands."):
+        return None
+    types, texts = get_type_hints(kind, include_extras=True), {}
+    for level in filter(dataclasses.is_dataclass, reversed(kind.__mro__)):
+        for item in docstring_parser.parse_from_object(level).params:
+            texts[item.arg_name] = " ".join((item.description or "").split())
+    found = []
+    for item in dataclasses.fields(kind):
+        default = item.default
+        if item.default_factory is not dataclasses.MISSING:
+            default = item.default_factory()
+        elif default is dataclasses.MISSING:
+            default = tyro.MISSING
+        default = getattr(given, item.name, default)
+        alike = _ALIKE.get(item.name, {})
+        shown = tyro.conf.arg(help_behavior_hint=_default, **alike)
+        typed: Any = Annotated[types[item.name], shown]
+        text = texts.get(item.name) or _TEXTS.get(item.name)
+        found.append(tyro.constructors.StructFieldSpec(item.name, typed, default, text))
+    return tyro.constructors.StructConstructorSpec(kind, tuple(found))
+
+
+def _default(value: str) -> str:
+    return "" if value in ("", "None", "False") else f"(default: {value})"
 
 
 def _one_of(commands: Commands) -> Any:

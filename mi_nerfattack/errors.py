@@ -12,6 +12,10 @@ class NerfAttackError(Exception):
     A message reads ``<file or parameter>: <what is wrong, with the value>;
     <what is allowed or what to do>``. Where it quotes much of a file, its middle is
     left out.
+
+    Attributes:
+        where: the file or parameter.
+        remedy: what is allowed, or what to do; empty where the message says neither.
     """
 
     def __init__(self, message: str) -> None:
@@ -19,6 +23,9 @@ class NerfAttackError(Exception):
             left_out = f" ... ({len(message) - _HEAD - _TAIL} characters) ... "
             message = message[:_HEAD] + left_out + message[-_TAIL:]
         super().__init__(message)
+        self.where = message.partition(": ")[0]
+        _, found, last = message.rpartition("; ")
+        self.remedy = found and last
 
 
 class InputError(NerfAttackError, ValueError):

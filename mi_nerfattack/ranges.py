@@ -8,7 +8,14 @@ from functools import cache
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import (
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    TypeAdapter,
+    ValidationError,
+)
+from pydantic_core import CoreSchema
 
 from mi_nerfattack.errors import InputError
 
@@ -29,6 +36,7 @@ ControlUnit = Annotated[
 ]
 
 _T = TypeVar("_T")
+_STRICT = ConfigDict(extra="forbid", strict=True)
 
 
 def checked(owner: str = "") -> Callable[[type[_T]], type[_T]]:
@@ -59,10 +67,21 @@ def checked(owner: str = "") -> Callable[[type[_T]], type[_T]]:
             if further is not None:
                 further(self)
 
-        cls.__post_init__ = check  # type: ignore[attr-defined]
+        checked_class: Any = cls
+        checked_class.__post_init__ = check
+        checked_class.__pydantic_config__ = _STRICT
+        checked_class.__get_pydantic_core_schema__ = classmethod(_from_table)
         return cls
 
     return decorate
+
+
+def _from_table(cls: type, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    """Let a scenario's table give the fields: each strict, the object made of them."""
+    schema = handler(source)
+    found: Any = handler.resolve_ref_schema(schema)
+    found["strict"] = False
+    return schema
 
 
 @cache

@@ -24,7 +24,6 @@ _MODULES = (
     "brick_field",
     "splat_background",
     "field_emitter",
-    "aovs",
     "film",
     "limits",
     "nested",

@@ -9,10 +9,10 @@ from typing import Any
 import drjit as dr
 
 from mi_nerfattack.backend.freeze import freeze_method
-from mi_nerfattack.render.backdrop import Layer
-from mi_nerfattack.render.composite import AbstractComposite, Seen, Task, TaskQueue
+from mi_nerfattack.render.backdrop import AbstractBackdrop, Layer
+from mi_nerfattack.render.composite import AbstractComposite, Seen
 from mi_nerfattack.render.march import RayGradient
-from mi_nerfattack.render.rays import March, Rays
+from mi_nerfattack.render.rays import March, Rays, Task, TaskQueue
 from mi_nerfattack.render.scene_march import AbstractSceneMarch
 
 
@@ -34,7 +34,8 @@ class RayCollector:
         self.waits = False
         self._parts = composite, list(posed), stop
         self._wanted: tuple[int, ...] = ()
-        self._queue = TaskQueue(freeze_method(self._accumulate, self._state))
+        self._frozen = freeze_method(self._accumulate, self._state)
+        self._queue = TaskQueue(self._launch)
         self._by_rays = freeze_method(self._march_back, self._rays_state)
 
     def add(self, rays: Rays, seen: Seen, cotangent: Seen) -> None:
@@ -50,7 +51,8 @@ class RayCollector:
     ) -> list[RayGradient]:
         """See :meth:`AbstractComposite.backward_rays`; marches at once."""
         self._wanted = tuple(wanted)
-        if not self.waits:  # a render, which somebody may be recording
+        # A render, which somebody may be recording, or what cannot be recorded
+        if not self.waits or self._has_backdrop(wanted):
             return self._march_back(rays, seen, cotangent)
         dr.make_opaque(rays, seen, cotangent)
         return self._by_rays(rays, seen, cotangent)
@@ -73,6 +75,13 @@ class RayCollector:
     def finish(self) -> None:
         """March the rays that wait."""
         self._queue.finish()
+
+    def _launch(self, task: Task) -> None:
+        once = self._has_backdrop(task.fields)
+        (self._accumulate if once else self._frozen)(task)
+
+    def _has_backdrop(self, layers: Sequence[int]) -> bool:
+        return any(isinstance(self._parts[1][k], AbstractBackdrop) for k in layers)
 
     def _accumulate(self, task: Task) -> None:
         composite, posed, stop = self._parts
@@ -107,25 +116,34 @@ class FrozenComposite:
             rays: n rays, without literals.
             width: rays in a row.
         """
+        _, posed, stop = self._parts
+        kept: list[March | None] = []
+        for k, layer in enumerate(posed):
+            if isinstance(layer, AbstractBackdrop):  # cannot be recorded
+                kept.append(layer.march(rays, stop))
+            else:
+                kept.append(self._scene(rays, width) if k == 0 else None)
+        return self._render(rays, kept)
+
+    def _scene(self, rays: Rays, width: int) -> March | None:
+        """March the first layer, mostly the scene, in the fastest way, if there is."""
         composite, posed, stop = self._parts
-        if not posed or posed[0].has_gradients:
-            return self._render(rays, [])
-        # The first layer, mostly the scene, in the fastest way
+        if posed[0].has_gradients:
+            return None
         if self._first is None:
             self._first = composite.ahead(posed[0], stop)
         if self._first is None:
-            return self._render(rays, [])
-        alone = replace(rays, gains=rays.gains[:1])
-        return self._render(rays, [self._first.march(alone, width)])
+            return None
+        return self._first.march(replace(rays, gains=rays.gains[:1]), width)
 
-    def _record(self, rays: Rays, kept: list[March]) -> Seen:
+    def _record(self, rays: Rays, kept: list[March | None]) -> Seen:
         composite, posed, stop = self._parts
-        if not kept:
+        if not any(kept):
             return composite.render(posed, rays, stop)
         return composite.restore(posed, rays, kept, stop)
 
-    def _state(self, rays: Rays, kept: list[March]) -> list[Any]:
+    def _state(self, rays: Rays, kept: list[March | None]) -> list[Any]:
         """Return what the frozen :meth:`_record` reads beside its arguments."""
         composite, posed, stop = self._parts
-        sizes = dr.width(rays.direction), len(kept)
+        sizes = dr.width(rays.direction), [layer is None for layer in kept]
         return [composite, stop, sizes, [item.state() for item in posed]]

@@ -11,11 +11,12 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_nerfattack.plugins import limits
-from mi_nerfattack.plugins.aovs import FieldChannels
 from mi_nerfattack.plugins.collector import FrozenComposite, RayCollector
 from mi_nerfattack.plugins.field_volume import AbstractFieldVolume
 from mi_nerfattack.plugins.film import FilmIntegrator
 from mi_nerfattack.plugins.nested import (
+    FieldChannels,
+    Sampled,
     State,
     lay_over,
     look,
@@ -35,7 +36,7 @@ from mi_nerfattack.render.composite import Seen
 from mi_nerfattack.render.lighting import spectrum
 from mi_nerfattack.render.lighting.relight import LIGHT_SAMPLES, Relighting
 from mi_nerfattack.render.rays import Rays
-from mi_nerfattack.render.surroundings import nearest_surface
+from mi_nerfattack.render.scene_march import nearest_surface
 
 
 class FieldIntegrator(FilmIntegrator):
@@ -209,10 +210,6 @@ class FieldIntegrator(FilmIntegrator):
     def differentiating(self, scene: mi.Scene, mode: dr.ADMode) -> Iterator[None]:
         """Prepare to differentiate by the parameters that have gradients enabled.
 
-        Args:
-            scene: that is rendered.
-            mode: forward or backward.
-
         Raises:
             InputError: a derivative that is not computed; the message names what is.
         """
@@ -248,7 +245,15 @@ class FieldIntegrator(FilmIntegrator):
         cotangents as ``δsplats``, and finds their tangents in the place of the state.
         ``width`` are the rays in a row of an image, where nothing is being recorded.
         """
-        del depth, δaovs, kwargs
+        del depth, kwargs
+        is_primal = mode == dr.ADMode.Primal
+        # Inside `moment`, which leaves the derivatives to Dr.Jit
+        if is_primal and not width and (leaves := limits.attached(scene)):
+            limits.check_ray(
+                ray, "inside another integrator; take the fields out of it"
+            )
+            call = {"scene": scene, "sampler": sampler, "ray": ray, "active": active}
+            return *dr.custom(Sampled, self, call, leaves), None
         attached, ray = ray, mi.Ray3f(dr.detach(ray))
         active = mi.Bool(active)
         jitter = sampler.next_1d(active) if self.jitter else mi.Float(0.5)
@@ -257,22 +262,22 @@ class FieldIntegrator(FilmIntegrator):
         rays = Rays(ray.o, ray.d, t_max, jitter, active)
         # I and a of the fields (A.1 to A.6), and L_b behind them
         if state_in is None:  # primal mode, or forward mode, which comes without
-            inner = sampler if mode == dr.ADMode.Primal else sampler.clone()
+            inner = sampler if is_primal else sampler.clone()
             state_in = look(self, scene, inner, ray, rays, width)
         state: State = state_in
         rays.gains = state.gains
         valid = state.seen.total.opacity > 0
         if state.valid is not None:
             valid |= state.valid
-        if mode == dr.ADMode.Primal:  # L = I + (1 - a) L_b
+        if is_primal:  # L = I + (1 - a) L_b
             radiance = lay_over(self, state.seen.total, rays, state.behind, ray)
             aovs = [*self.channels.of_sample(state.seen), *state.aovs]
             return radiance, valid, aovs, state
         if mode == dr.ADMode.Backward:  # from dJ/dL to the parameters, and to the ray
-            self._backward(scene, sampler, attached, rays, state, δL, δsplats)
+            self._backward(scene, sampler, attached, rays, state, δL, δsplats, δaovs)
             return δL, valid, [], None
         # Forward: from tangents of the parameters to that of L
-        limits.check_forward(attached)
+        limits.check_ray(attached, "in forward mode; use dr.backward")
         tangent, t_splats = push_forward(self, scene, sampler, ray, rays, state)
         return tangent, valid, [], t_splats
 
@@ -285,6 +290,7 @@ class FieldIntegrator(FilmIntegrator):
         state: State,
         δL: Any,
         δsplats: Any,
+        δaovs: Any,
     ) -> None:
         """Accumulate the gradients of all that the rays show."""
         by_camera = limits.is_attached(ray)
@@ -297,15 +303,15 @@ class FieldIntegrator(FilmIntegrator):
             dr.enable_grad(leaf.seen, leaf.behind, direction)
             lit = replace(rays, direction=direction)
             radiance = lay_over(self, leaf.seen.total, lit, leaf.behind, ray)
-            result = dr.sum(radiance * δL)
+            pairs = []
             if δsplats is not None:
-                δalpha, δothers = δsplats
                 alpha, others = self.splats(leaf)
-                pairs = zip(others, δothers, strict=True)
-                result += alpha * δalpha + sum((x * δ for x, δ in pairs), mi.Float(0))
-            dr.backward_from(result)
+                pairs = [(alpha, δsplats[0]), *zip(others, δsplats[1], strict=True)]
+            if δaovs:
+                pairs += zip(self.channels.of_sample(leaf.seen), δaovs, strict=False)
+            dr.backward_from(sum((x * δ for x, δ in pairs), dr.sum(radiance * δL)))
             cotangent = dr.grad(leaf.seen)
-            if δsplats is None:  # the colour depends on the total alone
+            if not pairs:  # the colour depends on the total alone
                 cotangent = Seen(cotangent.total)
             δbehind = None if leaf.behind is None else dr.grad(leaf.behind)
             by_sky = dr.grad(direction) if by_camera else None
@@ -380,12 +386,7 @@ class FieldIntegrator(FilmIntegrator):
         return replace(state, seen=seen)
 
     def restore(self, ray: mi.Ray3f, kept: State) -> State:
-        """Return the state that :meth:`keep` was given.
-
-        Args:
-            ray: the rays again.
-            kept: of the state.
-        """
+        """Return the state of rays that :meth:`keep` was given."""
         rays = Rays(ray.o, ray.d, gains=kept.gains)
         seen = self.composite.restore(self.posed, rays, kept.seen, self.stop)
         return replace(kept, seen=seen)

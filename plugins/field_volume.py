@@ -12,7 +12,7 @@ import numpy as np
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import AbstractField, load_field
-from mi_nerfattack.fields.grid import check_positive
+from mi_nerfattack.fields.base import check_positive
 from mi_nerfattack.plugins.properties import Mask, read_filename, read_pose
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.lighting import spectrum

@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.backend.differentiate import differentiates_rays
+from mi_nerfattack.backend.arrays import differentiates_rays
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.plugins.field_emitter import FieldEmitter
 from mi_nerfattack.render.backdrop import fields_by_rays
@@ -89,8 +89,18 @@ def _check_relit(integrator: Any, key: str, node: Any) -> None:
         raise InputError(_RELIT.format(key))
 
 
+def attached(scene: mi.Scene) -> list[Any]:
+    """Return the parameters of a scene that have gradients enabled."""
+    found = [_value(*item[:3]) for item in mi.traverse(scene).properties.values()]
+    return [value for value in found if dr.grad_enabled(value)]
+
+
+def _value(value: Any, kind: Any, node: Any) -> Any:
+    return mi.get_property(value, kind, node) if kind else value
+
+
 def _is_attached(value: Any, kind: Any, node: Any) -> bool:
-    return dr.grad_enabled(mi.get_property(value, kind, node) if kind else value)
+    return dr.grad_enabled(_value(value, kind, node))
 
 
 def is_attached(ray: mi.Ray3f) -> bool:
@@ -99,10 +109,10 @@ def is_attached(ray: mi.Ray3f) -> bool:
         return dr.grad_enabled(ray.o) or dr.grad_enabled(ray.d)
 
 
-def check_forward(ray: mi.Ray3f) -> None:
-    """Raise InputError if a ray has tangents."""
+def check_ray(ray: mi.Ray3f, where: str) -> None:
+    """Raise InputError, which says `where`, if a ray has derivatives."""
     if is_attached(ray):
-        raise InputError("sensor: has no derivative in forward mode; use dr.backward")
+        raise InputError(f"sensor: has no derivative {where}")
 
 
 def _is_own(integrator: Any, node: Any) -> bool:

@@ -15,7 +15,7 @@ from mi_nerfattack.plugins.ngp_field import NGPFieldVolume
 from mi_nerfattack.plugins.splat_background import SplatBackgroundVolume
 from mi_nerfattack.render.backdrop import Layer
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.splats import SplatBackground
+from mi_nerfattack.render.splatting.background import SplatBackground
 
 _KINDS: dict[str, type[AbstractFieldVolume]] = {
     kind.kind: kind for kind in (GridFieldVolume, NGPFieldVolume, BrickFieldVolume)

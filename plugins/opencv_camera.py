@@ -11,21 +11,29 @@ import numpy as np
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.plugins.properties import Mask
-from mi_nerfattack.render.camera.distortion import distort, jacobian, undistort
+from mi_nerfattack.render.camera.distortion import (
+    bend,
+    direction,
+    distort,
+    jacobian,
+    unbend,
+    undistort,
+)
 from mi_nerfattack.render.camera.intrinsics import Camera
 
-_INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+_PINHOLE = ("fx", "fy", "cx", "cy")
+_LENS = {False: ("k1", "k2", "p1", "p2"), True: ("k1", "k2", "k3", "k4")}
 
 
 class OpencvCamera(mi.Sensor):
     r"""
     .. _sensor-opencv_camera:
 
-    Pinhole camera with OpenCV's lens distortion (:monosp:`opencv_camera`)
-    ----------------------------------------------------------------------
+    Pinhole camera or fisheye with OpenCV's lens distortion (:monosp:`opencv_camera`)
+    ---------------------------------------------------------------------------------
 
     .. pluginparameters::
-     :extra-rows: 11
+     :extra-rows: 13
 
      * - fx
        - |float|
@@ -49,8 +57,16 @@ class OpencvCamera(mi.Sensor):
 
      * - p1, p2
        - |float|
-       - Tangential distortion. (Default: 0)
+       - Tangential distortion, of a pinhole camera alone. (Default: 0)
        - |exposed|, |differentiable|, |discontinuous|
+
+     * - k3, k4
+       - |float|
+       - More radial distortion, of a fisheye alone, exposed as ``k1``. (Default: 0)
+
+     * - fisheye
+       - |bool|
+       - Whether ``k1`` to ``k4`` are those of OpenCV's fisheye. (Default: false)
 
      * - to_world
        - |transform|
@@ -59,8 +75,8 @@ class OpencvCamera(mi.Sensor):
 
      * - near_clip, far_clip
        - |float|
-       - Rays start and end at these distances along z, metres.
-         (Default: 1e-2, 1e4)
+       - Rays start and end at these distances along z, metres; of a fisheye, along
+         the ray. (Default: 1e-2, 1e4)
        - |exposed|
 
      * - shutter_open
@@ -95,9 +111,17 @@ class OpencvCamera(mi.Sensor):
         x' = x (1 + k_1 r^2 + k_2 r^4) + 2 p_1 x y + p_2 (r^2 + 2 x^2), \quad
         y' = y (1 + k_1 r^2 + k_2 r^4) + p_1 (r^2 + 2 y^2) + 2 p_2 x y.
 
-    Rays follow from eight Newton steps. Pixels count from the top-left corner of the
-    full film, so the centre of the first pixel is (0.5, 0.5), as in COLMAP. OpenCV
-    counts from the centre of the first pixel: add 0.5 to its principal point.
+    A fisheye sees a point at the angle :math:`\theta` from the axis, which may be more
+    than 90 degrees, at a distance from the principal point of
+
+    .. math::
+
+        \theta (1 + k_1 \theta^2 + k_2 \theta^4 + k_3 \theta^6 + k_4 \theta^8)
+
+    focal lengths. Rays follow from eight Newton steps. Pixels count from the top-left
+    corner of the full film, so the centre of the first pixel is (0.5, 0.5), as in
+    COLMAP. OpenCV counts from the centre of the first pixel: add 0.5 to its principal
+    point.
 
     Other values need no other kernel, unless the first distortion coefficient becomes
     other than zero.
@@ -140,17 +164,24 @@ class OpencvCamera(mi.Sensor):
         super().__init__(props)
         width, height = self.film().size()
         fx = props["fx"]
-        values = [fx, props.get("fy", fx)]
-        values += [props.get("cx", 0.5 * width), props.get("cy", 0.5 * height)]
-        values += [props.get(name, 0.0) for name in ("k1", "k2", "p1", "p2")]
+        values = [fx, props.get("fy", fx), props.get("cx", 0.5 * width)]
+        values.append(props.get("cy", 0.5 * height))
+        self.is_fisheye = bool(props.get("fisheye", False))
+        lens = _LENS[self.is_fisheye]
+        values += [props.get(name, 0.0) for name in lens]
+        for name in {*_LENS[not self.is_fisheye]}.difference(lens):
+            if props.get(name, 0.0):
+                raise InputError(
+                    f"{name}: not of this lens; fisheye: {self.is_fisheye}"
+                )
         self.intrinsics = {
             name: mi.Float(value)
-            for name, value in zip(_INTRINSICS, values, strict=True)
+            for name, value in zip((*_PINHOLE, *lens), values, strict=True)
         }
         self.near_clip = mi.Float(props.get("near_clip", 1e-2))
         self.far_clip = mi.Float(props.get("far_clip", 1e4))
         self.m_needs_sample_3 = False
-        self.parameters_changed([])
+        self.parameters_changed()
 
     def traverse(self, cb: mi.TraversalCallback) -> None:
         """Expose intrinsics, clip distances and pose."""
@@ -176,12 +207,12 @@ class OpencvCamera(mi.Sensor):
 
     def _film_or_lens_changed(self) -> None:
         film = self.film()
-        numbers = [float(dr.detach(v)[0]) for v in self.intrinsics.values()]
         # Where the film samples its border, rays start beyond the image.
         border = film.rfilter().border_size() if film.sample_border() else 0
         width, height = (int(v) + 2 * border for v in film.size())
-        fx, fy, cx, cy, *lens = numbers
-        camera = Camera(width, height, fx, fy, cx + border, cy + border, *lens)
+        values = {k: float(dr.detach(v)[0]) for k, v in self.intrinsics.items()}
+        values |= {name: values[name] + border for name in ("cx", "cy")}
+        camera = Camera(width, height, **values, is_fisheye=self.is_fisheye)
         self.is_distorted = camera.is_distorted
         self._crop_size = mi.Vector2f(film.crop_size())
         self._crop_offset = mi.Vector2f(film.crop_offset())
@@ -197,8 +228,8 @@ class OpencvCamera(mi.Sensor):
     ) -> tuple[mi.Ray3f, Any]:
         """Make the ray through a position in the crop window."""
         del sample3
-        x, y = self._unproject(mi.Point2f(sample2))
-        return self._ray(mi.Ray3f(), x, y, time, sample1, active)
+        towards = self._unproject(self._position(mi.Point2f(sample2)))
+        return self._ray(mi.Ray3f(), towards, time, sample1, active)
 
     def sample_ray_differential(
         self,
@@ -210,18 +241,24 @@ class OpencvCamera(mi.Sensor):
     ) -> tuple[mi.RayDifferential3f, Any]:
         """Make the ray and, to first order, those of the next pixels."""
         del sample3
-        x, y = self._unproject(mi.Point2f(sample2))
-        ray, weight = self._ray(mi.RayDifferential3f(), x, y, time, sample1, active)
+        position = self._position(mi.Point2f(sample2))
+        towards = self._unproject(position)
+        ray, weight = self._ray(mi.RayDifferential3f(), towards, time, sample1, active)
         lens = self.intrinsics
         step_x, step_y = dr.rcp(lens["fx"]), dr.rcp(lens["fy"])
-        by_u, by_v = (step_x, mi.Float(0)), (mi.Float(0), step_y)
-        if self.is_distorted:
-            xx, xy, yy, determinant = jacobian(x, y, *self._distortion())
-            by_u = (yy * step_x / determinant, -xy * step_x / determinant)
-            by_v = (-xy * step_y / determinant, xx * step_y / determinant)
         ray.o_x = ray.o_y = ray.o
-        ray.d_x = self._direction(x + by_u[0], y + by_u[1])
-        ray.d_y = self._direction(x + by_v[0], y + by_v[1])
+        if self.is_fisheye:  # where the plane z = 1 has no tangent
+            ahead = [mi.Point2f(step_x, 0), mi.Point2f(0, step_y)]
+            next_x, next_y = (self._unproject(position + step) for step in ahead)
+        else:
+            x, y = towards.x, towards.y
+            by_u, by_v = (step_x, mi.Float(0)), (mi.Float(0), step_y)
+            if self.is_distorted:
+                xx, xy, yy, determinant = jacobian(x, y, *self._distortion())
+                by_u = (yy * step_x / determinant, -xy * step_x / determinant)
+                by_v = (-xy * step_y / determinant, xx * step_y / determinant)
+            next_x, next_y = (mi.Vector3f(x + b[0], y + b[1], 1) for b in (by_u, by_v))
+        ray.d_x, ray.d_y = self._direction(next_x), self._direction(next_y)
         ray.has_differentials = True
         return ray, weight
 
@@ -231,13 +268,19 @@ class OpencvCamera(mi.Sensor):
         """Connect points to the camera; ``uv`` is in pixels of the crop window."""
         del sample
         local = self.m_to_world.inverse() @ mi.Point3f(it.p)
-        z = dr.select(local.z > 0, local.z, 1)
-        x, y = -local.x / z, -local.y / z
-        position, density = self._project(x, y)
-        seen = mi.Bool(active) & (local.z >= self.near_clip)
-        seen &= (local.z <= self.far_clip) & (density > 0)
-        seen &= dr.all((position >= 0) & (position <= self._crop_size))
         distance = dr.norm(local)
+        if self.is_fisheye:
+            along = distance
+            position, density = self._project_fisheye(local)
+        else:
+            along = local.z
+            z = dr.select(local.z > 0, local.z, 1)
+            position, density = self._project(-local.x / z, -local.y / z)
+            # On the plane z = 1, solid angle is area times the cosine's cube.
+            density *= (distance / z) ** 3
+        seen = mi.Bool(active) & (along >= self.near_clip)
+        seen &= (along <= self.far_clip) & (density > 0)
+        seen &= dr.all((position >= 0) & (position <= self._crop_size))
         ds = dr.zeros(mi.DirectionSample3f, dr.width(local))
         ds.uv = position
         ds.p = self.m_to_world.translation()
@@ -245,10 +288,7 @@ class OpencvCamera(mi.Sensor):
         ds.d = (ds.p - it.p) / distance
         ds.dist = distance
         ds.pdf = dr.select(seen, mi.Float(1), 0)
-        # On the plane z = 1, solid angle is area times the cosine's cube.
-        secant = distance / z
-        importance = density * secant**3 / distance**2
-        return ds, mi.Spectrum(dr.select(seen, importance, 0))
+        return ds, mi.Spectrum(dr.select(seen, density / distance**2, 0))
 
     def bbox(self) -> mi.ScalarBoundingBox3f:
         """Return the box that holds nothing but the pinhole."""
@@ -256,31 +296,59 @@ class OpencvCamera(mi.Sensor):
         return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(pinhole))
 
     def _ray(
-        self, ray: Any, x: mi.Float, y: mi.Float, time: Any, sample1: Any, active: Any
+        self, ray: Any, towards: mi.Vector3f, time: Any, sample1: Any, active: Any
     ) -> tuple[Any, Any]:
         nothing = dr.zeros(mi.SurfaceInteraction3f)
         ray.wavelengths, weight = self.sample_wavelengths(nothing, sample1, active)
         ray.time = time
-        ray.d = self._direction(x, y)
-        secant = dr.sqrt(x * x + y * y + 1)
+        ray.d = self._direction(towards)
+        secant = mi.Float(1) if self.is_fisheye else dr.norm(towards)
         near = self.near_clip * secant
         ray.o = self.m_to_world.translation() + near * ray.d
         ray.maxt = self.far_clip * secant - near
         return ray, weight
 
-    def _direction(self, x: mi.Float, y: mi.Float) -> mi.Vector3f:
-        return self.m_to_world @ dr.normalize(mi.Vector3f(-x, -y, 1))
+    def _direction(self, towards: mi.Vector3f) -> mi.Vector3f:
+        """Turn OpenCV's axes, whatever the length, into the world's, of length 1."""
+        local = mi.Vector3f(-towards.x, -towards.y, towards.z)
+        return self.m_to_world @ dr.normalize(local)
 
     def _distortion(self) -> tuple[mi.Float, ...]:
-        return tuple(self.intrinsics[name] for name in ("k1", "k2", "p1", "p2"))
+        return tuple(self.intrinsics[name] for name in _LENS[self.is_fisheye])
 
-    def _unproject(self, sample: mi.Point2f) -> tuple[mi.Float, mi.Float]:
-        """Map the crop window's [0, 1]^2 to the undistorted plane z = 1."""
+    def _position(self, sample: mi.Point2f) -> mi.Point2f:
+        """Map the crop window's [0, 1]^2 to the distorted plane z = 1."""
         lens = self.intrinsics
         pixel = sample * self._crop_size + self._crop_offset
-        x = (pixel.x - lens["cx"]) / lens["fx"]
-        y = (pixel.y - lens["cy"]) / lens["fy"]
-        return undistort(x, y, *self._distortion()) if self.is_distorted else (x, y)
+        return mi.Point2f(
+            (pixel.x - lens["cx"]) / lens["fx"], (pixel.y - lens["cy"]) / lens["fy"]
+        )
+
+    def _unproject(self, position: mi.Point2f) -> mi.Vector3f:
+        """Map the distorted plane to directions, OpenCV's axes; z = 1 of a pinhole."""
+        x, y = position
+        if self.is_fisheye:
+            return mi.Vector3f(*direction(x, y, *self._distortion()))
+        if self.is_distorted:
+            x, y = undistort(x, y, *self._distortion())
+        return mi.Vector3f(x, y, 1)
+
+    def _project_fisheye(self, local: mi.Point3f) -> tuple[mi.Point2f, mi.Float]:
+        """Map points to pixels of the crop window; the density is by solid angle."""
+        lens, distortion = self.intrinsics, self._distortion()
+        across = dr.sqrt(local.x * local.x + local.y * local.y + 1e-20)
+        angle = dr.atan2(across, local.z)
+        radius, slope = bend(angle, *distortion)
+        sine = dr.maximum(dr.sin(angle), 1e-10)  # as small as the radius, in the middle
+        density = lens["fx"] * lens["fy"] / dr.prod(self._crop_size)
+        density *= radius / sine * slope
+        back = dr.abs(unbend(radius, *distortion) - angle)
+        density = dr.select(
+            back * dr.maximum(lens["fx"], lens["fy"]) < 1e-2, density, 0
+        )
+        u, v = -local.x / across * radius, -local.y / across * radius
+        pixel = mi.Point2f(u * lens["fx"] + lens["cx"], v * lens["fy"] + lens["cy"])
+        return pixel - self._crop_offset, density
 
     def _project(self, x: mi.Float, y: mi.Float) -> tuple[mi.Point2f, mi.Float]:
         """Map the plane z = 1 to pixels of the crop window.

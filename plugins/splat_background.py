@@ -2,43 +2,58 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, NoReturn
 
 import mitsuba as mi
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields.splats import read_splats
+from mi_nerfattack.fields.compact_splats import load_splats
 from mi_nerfattack.plugins.properties import Mask, read_filename, read_pose
 from mi_nerfattack.render.lighting import spectrum
-from mi_nerfattack.render.splats import SplatBackground
+from mi_nerfattack.render.splatting.background import SplatBackground
 
 
 class SplatBackgroundVolume(mi.Volume):
     r"""
     .. _volume-splat_background:
 
-    Gaussian splats as a constant background (:monosp:`splat_background`)
-    ---------------------------------------------------------------------
+    Gaussian splats as a background (:monosp:`splat_background`)
+    ------------------------------------------------------------
 
     .. pluginparameters::
+     :extra-rows: 2
 
      * - filename
        - |string|
-       - .ply of a 3D Gaussian splatting trainer: ``f_dc_*``, ``opacity``,
-         ``scale_*``, ``rot_*``, ``f_rest_*``
+       - .ply of a 3D Gaussian splatting trainer (``f_dc_*``, ``opacity``, ``scale_*``,
+         ``rot_*``, ``f_rest_*``), .spz or .splat
 
      * - to_world
        - |transform|
        - Rotation, translation and uniform scale (metres per unit of the file), file
          to world. (Default: identity)
 
+     * - harmonics
+       - :paramtype:`float[]`
+       - Coefficients of the colours' spherical harmonics, (n k 3,), in the order of the
+         file's splats; the first three of each are its ``f_dc_*``
+       - |exposed|, |differentiable|
+
+     * - opacity
+       - :paramtype:`float[]`
+       - Opacities at the splats' centres, (n,), within 0 and 1
+       - |exposed|, |differentiable|
+
     The scene that a 3D Gaussian splatting trainer wrote, seen by ``field_integrator``
-    behind, between and in front of fields, by depth. Rays meet splats through Mitsuba's
-    ``ellipsoids``, with the kernel of ``volprim_rf_basic``. The distance of their peaks
-    orders the splats: ``I = sum_i c_i a_i prod_{j<i} (1 - a_j)``. A splat's opacity is
+    behind, between and in front of fields, by depth. It is rasterised, for any lens,
+    with the kernel of Mitsuba's ``volprim_rf_basic``. The distance of their peaks on a
+    ray orders the splats:
+    ``I = sum_i c_i a_i prod_{j<i} (1 - a_j)``. A splat's opacity is
     ``a_i = min(opacity_i exp(-m_i^2 / 2), 0.9999)``. Here ``m_i`` is the least
     distance of the ray from the centre in standard deviations, at most 3. See
-    ``render.splats``.
+    ``render.splatting``.
 
     .. tabs::
         .. code-tab:: xml
@@ -64,7 +79,10 @@ class SplatBackgroundVolume(mi.Volume):
 
     Limits: a layer of the ``depth`` composite alone; splats have no density, so that
     ``interleaved``, media and ``field_emitter`` refuse them, and so does ``relit``.
-    It has no parameters in ``mi.traverse``, and nothing is differentiated by it.
+    ``drjit.freeze`` cannot record them.
+    Derivatives are by ``harmonics`` and ``opacity``, in both modes, and by the sensor
+    in backward mode. The edges of splats, three standard deviations away, and their
+    order count as constants: neither has a derivative.
     """
 
     def __init__(
@@ -73,10 +91,28 @@ class SplatBackgroundVolume(mi.Volume):
         spectrum.prepare()
         if posed is None:
             pose, name = read_pose(props), read_filename(props)
-            posed = SplatBackground(read_splats(name), pose)
+            posed = SplatBackground(load_splats(name), pose)
         super().__init__(props)
         self.posed = posed
         self.relit = False
+
+    def traverse(self, cb: mi.TraversalCallback) -> None:
+        """Expose the colours and opacities of the splats, in the order of the file."""
+        for name, value in self.posed.parameters().items():
+            cb.put(name, value, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+        """Hand changed parameters to the splats.
+
+        Raises:
+            InputError: a value that is not allowed, with its name.
+        """
+        del keys
+        self.posed.update()
+
+    def tangents(self) -> AbstractContextManager[None]:
+        """See :meth:`AbstractFieldVolume.tangents`: marches read the parameters."""
+        return nullcontext()
 
     def eval(self, it: mi.Interaction3f, active: Mask = True) -> Any:
         """Refuse to be a medium."""

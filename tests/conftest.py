@@ -13,7 +13,7 @@ import mi_nerfattack  # noqa: E402, F401  before drjit: it chooses the LLVM
 import random
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
@@ -22,8 +22,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers.variants import VARIANTS
 from hypothesis import HealthCheck, settings
+from support.reference.derivatives import VARIANTS
 
 SEED = 0
 
@@ -99,6 +99,16 @@ def no_variant_left() -> Iterator[None]:
     yield
     if before is not None and mi.variant() != before:
         mi.set_variant(before)
+
+
+@pytest.fixture
+def served(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[type], str]]:
+    """Give a function that serves with a handler of HTTP and returns the URL."""
+    from support.files.policies import serving  # imports onnx
+
+    monkeypatch.setenv("no_proxy", "*")
+    with serving() as start:
+        yield start
 
 
 @pytest.fixture

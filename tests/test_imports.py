@@ -16,11 +16,15 @@ PACKAGE = "mi_nerfattack"
 # Each part imports only what stands to its left.
 ORDER = (
     "errors ranges notebook backend io system vehicle policy scenes fields render "
-    "rollout capture plugins attack deploy fit scenario evaluation training report "
-    "experiment robot commands cli bench"
+    "rollout capture plugins attack deploy drives fit scenario evaluation training "
+    "report experiment car props commands cli bench"
 ).split()
 # Parts that can be used without torch; `vehicle` wraps it for its users.
 WITHOUT_TORCH = "errors io scenes fields render rollout capture plugins deploy".split()
+# What the computer of a car need not have, and parts whose import loads none of it.
+NOT_IN_A_CAR = {"mitsuba", "drjit", "torch", "mujoco", "gymnasium", "pandas"}
+NOT_IN_A_CAR |= {"matplotlib", "jinja2", "trimesh", "skimage", "onnx"}
+IN_A_CAR = ("car", "commands", "cli")
 
 
 def modules() -> Iterator[tuple[str, Path]]:
@@ -36,11 +40,11 @@ def modules() -> Iterator[tuple[str, Path]]:
 SOURCES = dict(modules())
 
 
-def imported(name: str) -> Iterator[str]:
-    """Yield the full names that a module imports, anywhere in its source."""
+def imported(name: str, is_deep: bool = True) -> Iterator[str]:
+    """Yield the full names that a module imports, in its functions too if deep."""
     path = SOURCES[name]
     package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-    for node in walk(ast.parse(path.read_text("utf-8"), str(path))):
+    for node in walk(ast.parse(path.read_text("utf-8"), str(path)), is_deep):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -53,13 +57,22 @@ def imported(name: str) -> Iterator[str]:
                 yield full if full in SOURCES else base
 
 
-def walk(tree: ast.AST) -> Iterator[ast.AST]:
+def walk(tree: ast.AST, is_deep: bool) -> Iterator[ast.AST]:
     """Yield the nodes of a tree but for what only a type checker sees."""
     if isinstance(tree, ast.If) and ast.unparse(tree.test) == "TYPE_CHECKING":
         return
+    if isinstance(tree, ast.FunctionDef) and not is_deep:
+        return
     yield tree
     for child in ast.iter_child_nodes(tree):
-        yield from walk(child)
+        yield from walk(child, is_deep)
+
+
+def loaded_with(name: str) -> Iterator[str]:
+    """Yield a module and its packages."""
+    while name:
+        yield name
+        name = name.rpartition(".")[0]
 
 
 def part(name: str) -> str:
@@ -108,16 +121,27 @@ def test_folders_are_small_and_no_family_of_prefixes():
         assert not families, f"{folder}: {families}: a missing folder"
 
 
-def test_parts_without_torch():
-    for name in SOURCES:
-        roots = {item.split(".")[0] for item in imported(name)}
-        assert part(name) not in WITHOUT_TORCH or "torch" not in roots, name
+def test_a_car_needs_no_renderer():
+    """Neither a module of these parts nor what its import loads imports any of it."""
+    waiting = [name for name in SOURCES if part(name) in IN_A_CAR]
+    chains = {name: name for name in waiting}
+    assert f"{PACKAGE}.car.drive.rig" in chains and f"{PACKAGE}.cli" in chains
+    for name in waiting:  # which grows
+        for target in imported(name, is_deep=False):
+            chain = f"{chains[name]} imports {target}"
+            assert target.split(".")[0] not in NOT_IN_A_CAR, chain
+            for item in loaded_with(target):
+                if item in SOURCES and item not in chains:
+                    chains[item] = chain
+                    waiting.append(item)
+    assert f"{PACKAGE}.render.camera.intrinsics" in chains
 
 
-def test_nothing_unpickles():
+def test_no_module_unpickles_and_parts_need_no_torch():
     for name in SOURCES:
         roots = {item.split(".")[0] for item in imported(name)}
         assert not roots & {"pickle", "dill", "cloudpickle", "shelve"}, name
+        assert part(name) not in WITHOUT_TORCH or "torch" not in roots, name
 
 
 def test_only_io_opens_files():

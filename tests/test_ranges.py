@@ -1,4 +1,4 @@
-"""Ranges of numbers as types, and what their dataclasses refuse."""
+"""Ranges of numbers as types, and what an error says where."""
 
 from __future__ import annotations
 
@@ -53,24 +53,39 @@ def test_what_is_outside_is_refused(change, message):
 
 
 @pytest.mark.parametrize(
-    ("make", "changes"),
+    ("make", "change"),
     [
-        (CollectSettings, [{"frames": 0}, {"object_share": 1.5}]),
-        (
-            CompareOptions,
-            [{"spp": 1}, {"spacing_m": 0.0}, {"near_m": math.inf}, {"worst": -1}],
-        ),
-        (EvaluateSettings, [{"runs": 0}, {"objects": -1}, {"horizon": 0}]),
-        (TrainSettings, [{"epochs": 0}, {"batch": 0}, {"learning_rate": 0.0}]),
+        (CollectSettings, {"object_share": 1.5}),
+        (CompareOptions, {"near_m": math.inf}),
+        (EvaluateSettings, {"objects": -1}),
+        (TrainSettings, {"learning_rate": 0.0}),
     ],
 )
-def test_settings_out_of_range_are_named(make, changes):
-    for change in changes:
-        (name,) = change
-        with pytest.raises(InputError, match=rf"{name}\b.*; "):
-            make(**change)
+def test_settings_out_of_range_are_named(make, change):
+    with pytest.raises(InputError, match=rf"{next(iter(change))}\b.*; "):
+        make(**change)
 
 
 def test_numbers_of_numpy_are_numbers():
     found = Sizes(count=np.int64(2), part=np.float32(0.25), frames={"a": 0})
     assert found.count == 2 and found.part == 0.25
+
+
+@pytest.mark.parametrize(
+    ("message", "where", "remedy"),
+    [
+        ("a.toml: x: 3; at most 2", "a.toml", "at most 2"),
+        ("a.toml: x; y: 3; at most 2", "a.toml", "at most 2"),
+        ("a.toml: no frames", "a.toml", ""),
+        ("--fps; give one", "--fps; give one", "give one"),
+    ],
+)
+def test_a_message_has_a_place_and_a_remedy(message, where, remedy):
+    error = InputError(message)
+    assert (str(error), error.where, error.remedy) == (message, where, remedy)
+
+
+def test_the_middle_of_a_long_message_is_left_out():
+    error = InputError("a.toml: " + 9000 * "x" + "; write it again")
+    assert len(str(error)) < 8000 and "(1524 characters)" in str(error)
+    assert (error.where, error.remedy) == ("a.toml", "write it again")

@@ -9,12 +9,12 @@ is the camera's middle part of its shape, resized; so it drives much alike at al
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from bench.render.sides import FOV_DEG
+from bench.render.cameras import FOV_DEG
 from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, PilotNet
 from mi_nerfattack.policy.preprocess import AbstractTransform, Crop, Resize
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
@@ -29,7 +29,6 @@ LATERAL_SD_M = 0.1
 ROUNDING_M = 0.05  # of the objective's absolute value
 RATE = 1e-6  # of Adam; small, so that all iterations drive alike
 MOUNT = CameraMount()
-BAKED = "baked"  # the way, and the role, with the scene as bricks
 APART_M = 1.5  # of further objects
 OBJECT_POSE = Pose.upright((-4.0, -3.4, 0.0), 0.0, 2.0)
 
@@ -50,10 +49,6 @@ class Job:
     poses: int
     horizon: int
     objects: int = 1
-
-    def arguments(self) -> list[str]:
-        """Return the job as a worker's arguments."""
-        return [str(value) for value in astuple(self)]
 
     @property
     def dt(self) -> float:

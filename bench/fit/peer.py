@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from bench.full_ngp import NGPData
-from bench.render.sides import COUNTED_RAYS, AbstractTrainer, Clock
-from bench.torch import device
-from bench.torch.encoding import PlainHashGrid, TunedHashGrid
-from bench.torch.fit import Pictures, Plan, TorchFit
-from mi_nerfattack.system.cores import cores
-
-GRIDS = {"plain": PlainHashGrid, "tuned": TunedHashGrid}
+from bench.ngp_data import NGPData
+from bench.render.peer import fastest
+from bench.torch.fit import COUNTED_RAYS, Pictures, TorchFit
+from bench.worker import Clock, wait
 
 
-class TorchTrainer(AbstractTrainer):
+class TorchTrainer:
     """Training steps in PyTorch; a batch is worked off in the way that is fastest here.
 
     Args:
-        style: of the encoding, a key of `GRIDS`.
         field: file of the field to start from.
         pictures: file of what to fit to.
         rays: of a step.
@@ -31,31 +25,21 @@ class TorchTrainer(AbstractTrainer):
 
     def __init__(
         self,
-        style: str,
-        field: Path,
-        pictures: Path,
+        field: str,
+        pictures: str,
         rays: int,
         chunk: int | None = None,
     ) -> None:
-        torch.set_num_threads(cores())
-        data = NGPData.read(field)
-        grid = GRIDS[style](data.layout)
-        self.fit = TorchFit(data, grid, Pictures.read(pictures), rays)
-        if chunk is not None:
-            self.fit.plan = Plan(chunk)
-        else:
-            plans = Plan.candidates(rays)
-            self._seconds(plans[0])  # warm up
-            seconds = {plan: self._seconds(plan) for plan in plans}
-            for plan in plans:
-                seconds[plan] = min(seconds[plan], self._seconds(plan))
-            self.fit.plan = min(plans, key=seconds.__getitem__)
+        data = NGPData.read(Path(field))
+        self.fit = TorchFit(data, Pictures.read(Path(pictures)), rays)
+        choices = [rays, max(1, rays // 4)] if chunk is None else [chunk]
+        self.fit.chunk = fastest(choices, self._seconds)
 
     def steps(self, count: int) -> dict[str, float]:
-        """See :meth:`AbstractTrainer.steps`."""
+        """Do training steps, as :meth:`OurTrainer.steps` does."""
         clock = Clock()
         loss = sum(self.fit.step() for _ in range(count))
-        device.wait()
+        wait()
         return {**clock.per_step(count), "loss": loss / count}
 
     def facts(self) -> dict[str, Any]:
@@ -64,19 +48,12 @@ class TorchTrainer(AbstractTrainer):
             "rays": self.fit.rays,
             "samples": self.fit.count_samples(COUNTED_RAYS),
             "threads": torch.get_num_threads(),
-            "chunk_rays": self.fit.plan.chunk,
-            "batches_by_rank": len(self.fit.plan.batches),
+            "chunk_rays": self.fit.chunk,
         }
 
-    def memory(self) -> dict[str, float]:
-        """Add what tensors took of a GPU, in MB."""
-        return super().memory() | device.memory()
-
-    def _seconds(self, plan: Plan) -> float:
+    def _seconds(self, chunk: int) -> float:
         """Time the gradients of a batch; the field does not change."""
-        self.fit.plan = plan
-        drawn = self.fit.draw()
-        start = time.perf_counter()
+        self.fit.chunk, drawn, clock = chunk, self.fit.draw(), Clock()
         self.fit.gradients(*drawn)
-        device.wait()
-        return time.perf_counter() - start
+        wait()
+        return clock.per_step()["seconds"]

@@ -4,29 +4,26 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from bench.full_ngp import NGPData
-from bench.render.sides import STOP, AbstractSide, pinhole_rays, route_rays
-from mi_nerfattack.fields import GridField, GridLayout, load_grid
-from mi_nerfattack.render.camera.intrinsics import look_at
-from mi_nerfattack.render.camera.pose import Pose
+from bench.ngp_data import NGPData
+from bench.render.cameras import STOP, route_rays
 from mi_nerfattack.render.composite import Seen
 from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
 from mi_nerfattack.render.walk import Walk
-from mi_nerfattack.scenes import bundled
 
 NGP_PARAMETERS = ("table", "density_weights", "colour_weights")
 Leaf = tuple[Callable[[], Any], Callable[[Any], None]]
 
 
-class OurSide(AbstractSide):
+class OurSide:
     """Our renderer with a field.
 
     Args:
@@ -64,7 +61,7 @@ class OurSide(AbstractSide):
         return rays
 
     def forward(self) -> float:
-        """See :meth:`AbstractSide.forward`."""
+        """Render a frame and return the seconds it took."""
         dr.sync_thread()
         start = time.perf_counter()
         self.seen = self.composite.render([self.posed], self.rays, STOP)
@@ -76,7 +73,11 @@ class OurSide(AbstractSide):
         return time.perf_counter() - start
 
     def backward(self) -> tuple[float, float]:
-        """See :meth:`AbstractSide.backward`."""
+        """Differentiate a scalar of the image by all parameters.
+
+        Returns:
+            seconds of the derivative alone, and of everything from the rays on.
+        """
         forward = self.forward()
         start = time.perf_counter()
         for read, replace in self.leaves:
@@ -104,14 +105,13 @@ class OurSide(AbstractSide):
             "threads": dr.thread_count(),
         }
 
-    def memory(self) -> dict[str, float]:
-        """Add Dr.Jit's own peak during a forward and a backward pass, in MB."""
+    def drjit_memory(self) -> float:
+        """Return Dr.Jit's own peak during a forward and a backward pass, in MB."""
         dr.sync_thread()
         dr.flush_malloc_cache()
         dr.detail.malloc_clear_statistics()
         self.backward()
-        peak = dr.detail.malloc_watermark(dr.backend_v(mi.Float))
-        return {**super().memory(), "drjit_peak_memory_mb": peak / 1e6}
+        return dr.detail.malloc_watermark(dr.backend_v(mi.Float)) / 1e6
 
     def kernels(self) -> int:
         """Move the camera, render, differentiate, and count what is compiled."""
@@ -125,9 +125,9 @@ class OurSide(AbstractSide):
         return sum(not entry["cache_hit"] for entry in history)
 
 
-def scene_side(data: NGPData, width: int, height: int) -> OurSide:
+def scene_side(path: str, width: int, height: int) -> OurSide:
     """Look along the route at a scene's field; differentiate by table and networks."""
-    field = data.field()
+    field = NGPData.read(Path(path)).field()
 
     def leaf(name: str) -> Leaf:
         return (
@@ -137,34 +137,6 @@ def scene_side(data: NGPData, width: int, height: int) -> OurSide:
 
     leaves = [leaf(name) for name in NGP_PARAMETERS]
     return OurSide(PosedField(field), leaves, route_rays(width, height))
-
-
-def object_side(width: int, height: int) -> OurSide:
-    """Look at the bundled hydrant, lying, so that it fills the frame."""
-    field = load_grid(bundled("hydrant/field.safetensors"))
-    lying = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-    centre = (field.lower + field.upper) / 2
-    posed = PosedField(field, Pose(lying, -lying @ centre))
-    camera = look_at([0.0, -1.3, 0.0], [0.0, 0.0, 0.0])
-    rays = pinhole_rays(width, height, 40.0, camera)
-    return OurSide(posed, [_packed(field)], rays)
-
-
-def slab_side(width: int, height: int, samples: int) -> OurSide:
-    """Look through a thin medium in which each ray takes `samples` samples."""
-    corner = np.array([0.5, 0.5, 0.5])
-    field = GridField(
-        GridLayout(), -corner, corner, density_scale=1e-3, step_m=1 / samples
-    )
-    rays = pinhole_rays(width, height, 2.0, look_at([0.0, -5.0, 0.0], [0.0, 0.0, 0.0]))
-    return OurSide(PosedField(field), [_packed(field)], rays)
-
-
-def _packed(field: GridField) -> Leaf:
-    def replace(value: Any) -> None:
-        field.packed = value
-
-    return lambda: field.packed, replace
 
 
 @dr.syntax

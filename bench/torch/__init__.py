@@ -1,1 +1,1 @@
-"""The peers: the same fields and loop in PyTorch."""
+"""The peer: the same fields and loop in PyTorch."""

@@ -1,32 +1,34 @@
-"""The multi-resolution hash encoding in PyTorch, in two styles.
+"""The multi-resolution hash encoding in PyTorch: the fastest that we found.
 
-Both index the table as `drjit.hashgrid.HashGridEncoding` with aligned corners does: a
-level is dense where all its vertices fit into the table, otherwise hashed with the
-primes of tiny-cuda-nn. Source: Mueller et al. 2022, section 3.
+All arithmetic runs along contiguous points; both features of a vertex travel as one
+complex number; the derivative is added straight into ``table.grad``. The table is
+indexed as `drjit.hashgrid.HashGridEncoding` with aligned corners does: a level is dense
+where all its vertices fit into the table, otherwise hashed with the primes of
+tiny-cuda-nn. Source: Mueller et al. 2022, section 3.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 
-from bench.full_ngp import PRIMES, level_sizes
+from bench.ngp_data import PRIMES, level_sizes
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.ngp import NGPLayout
 
 
-class AbstractHashGrid(ABC):
+class HashGrid:
     """Hash encoding of points; the table itself is an argument.
 
     Args:
-        layout: levels, features and the size of the table.
+        layout: levels, of two features a vertex, and the size of the table.
     """
 
     def __init__(self, layout: NGPLayout) -> None:
+        if layout.features != 2:
+            raise InputError(f"features: {layout.features}; the peer needs 2")
         self.levels, self.features = layout.levels, layout.features
         sizes = level_sizes(layout)
         slots = np.array([size for _, _, size in sizes])
@@ -42,7 +44,6 @@ class AbstractHashGrid(ABC):
         self.first = torch.tensor(np.cumsum(slots) - slots, dtype=torch.int32)
         self.mask = torch.tensor(slots - 1, dtype=torch.int32)
 
-    @abstractmethod
     def __call__(self, table: torch.Tensor, unit: torch.Tensor) -> torch.Tensor:
         """Encode points.
 
@@ -53,57 +54,6 @@ class AbstractHashGrid(ABC):
         Returns:
             (n, levels * features), differentiable by the table.
         """
-
-
-class PlainHashGrid(AbstractHashGrid):
-    """The encoding as one writes it down: points first, one embedding bag, autograd."""
-
-    def __call__(self, table: torch.Tensor, unit: torch.Tensor) -> torch.Tensor:
-        """See :meth:`AbstractHashGrid.__call__`."""
-        place = unit[:, None, :] * self.scale[:, None]  # (n, levels, 3)
-        low = place.floor()
-        part = place - low
-        weight = torch.stack([1 - part, part], -1)  # (n, levels, 3, 2)
-        key = low.to(torch.int32) * self.factors
-        key = torch.stack([key, key + self.factors], -1)
-        x = key[:, :, 0, None, None, :]
-        y = key[:, :, 1, None, :, None]
-        z = key[:, :, 2, :, None, None]
-        n = self.dense
-        hashed = (z[:, n:] ^ y[:, n:] ^ x[:, n:]) & self.mask[n:, None, None, None]
-        index = torch.cat([z[:, :n] + y[:, :n] + x[:, :n], hashed], 1)
-        index = index + self.first[:, None, None, None]
-        weight = (
-            weight[:, :, 2, :, None, None]
-            * weight[:, :, 1, None, :, None]
-            * weight[:, :, 0, None, None, :]
-        )
-        bags = F.embedding_bag(
-            index.reshape(-1, 8),
-            table,
-            mode="sum",
-            per_sample_weights=weight.reshape(-1, 8),
-        )
-        return bags.reshape(len(unit), -1)
-
-
-class TunedHashGrid(AbstractHashGrid):
-    """The fastest we found: points last, complex gathers, a derivative by hand.
-
-    All arithmetic runs along contiguous points; both features of a vertex travel as
-    one complex number; the derivative is added straight into ``table.grad``.
-
-    Args:
-        layout: of two features a vertex.
-    """
-
-    def __init__(self, layout: NGPLayout) -> None:
-        super().__init__(layout)
-        if layout.features != 2:
-            raise InputError(f"features: {layout.features}; the tuned peer needs 2")
-
-    def __call__(self, table: torch.Tensor, unit: torch.Tensor) -> torch.Tensor:
-        """See :meth:`AbstractHashGrid.__call__`."""
         index, weight = self._corners(unit.T.contiguous())
         features = _GatherSum.apply(table, index, weight)
         return features.permute(1, 0, 2).reshape(len(unit), -1)

@@ -13,13 +13,13 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from bench.full_ngp import NGPData
-from bench.render.sides import STOP
-from bench.torch.encoding import AbstractHashGrid
-from bench.torch.ngp import BATCHES, TorchNGP
+from bench.ngp_data import NGPData
+from bench.render.cameras import STOP
+from bench.torch.ngp import TorchNGP
 from mi_nerfattack.io import files
 
-ALL_AT_ONCE = ((0, 1 << 30),)
+COUNTED_RAYS = 1 << 12  # of which the samples of a step are counted
+ALL_AT_ONCE = ((0, 1 << 30),)  # faster than by ranks, with a graph
 BELOW_WHITE = 1 - 1e-5  # as our loss does: the curve has no derivative above 1
 
 
@@ -47,31 +47,11 @@ class Pictures:
         return Pictures(**files.read_safetensors(path)[0])
 
 
-@dataclass(frozen=True)
-class Plan:
-    """How a batch is worked off; the result does not depend on it.
-
-    Attributes:
-        chunk: rays in one graph; gradients of chunks are added up.
-        batches: ranks of samples that are evaluated together; see `TorchNGP`.
-    """
-
-    chunk: int
-    batches: tuple[tuple[int, int], ...] = ALL_AT_ONCE
-
-    @staticmethod
-    def candidates(rays: int) -> list[Plan]:
-        """Return what is worth trying for a number of rays a step."""
-        chunks = sorted({max(1, rays // share) for share in (1, 4)}, reverse=True)
-        return [Plan(chunk, b) for chunk in chunks for b in (ALL_AT_ONCE, BATCHES)]
-
-
 class TorchFit:
     """A field being fitted in PyTorch.
 
     Args:
         data: the field to start from; its occupancy stays as it is.
-        grid: the encoding, of the field's layout.
         pictures: what to fit to.
         rays: of a step.
         huber: where the loss turns linear, sRGB values.
@@ -80,20 +60,20 @@ class TorchFit:
 
     Attributes:
         leaves: all that is trained.
-        plan: how a batch is worked off.
+        chunk: rays in one graph; gradients of chunks are added up.
     """
 
     def __init__(
         self,
         data: NGPData,
-        grid: AbstractHashGrid,
         pictures: Pictures,
         rays: int,
         huber: float = 0.1,
         learning_rate: float = 1e-2,
         seed: int = 0,
     ) -> None:
-        self.model = TorchNGP(data, grid, STOP)
+        self.model = TorchNGP(data, STOP)
+        self.model.batches = ALL_AT_ONCE
         self.leaves = [*self.model.parameters.values(), self.model.sky]
         for leaf in self.leaves:
             leaf.requires_grad_(True)
@@ -106,7 +86,7 @@ class TorchFit:
         self.pixels = pictures.colour.shape[1]
         self.rays, self.huber = rays, huber
         self.random = torch.Generator(torch.get_default_device()).manual_seed(seed)
-        self.plan = Plan(rays)
+        self.chunk = rays
 
     def step(self) -> float:
         """Do one step of the optimiser and return the loss before it."""
@@ -122,8 +102,7 @@ class TorchFit:
     def gradients(self, index: torch.Tensor, jitter: torch.Tensor) -> float:
         """Replace the leaves' gradients by those of the mean loss; return that."""
         self.optimiser.zero_grad()
-        self.model.batches = self.plan.batches
-        total, chunk = 0.0, self.plan.chunk
+        total, chunk = 0.0, self.chunk
         for some, shift in zip(index.split(chunk), jitter.split(chunk), strict=True):
             loss = self.loss(some, shift) * (len(some) / len(index))
             loss.backward()

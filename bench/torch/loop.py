@@ -199,27 +199,6 @@ class TorchVehicle:
         return control * (1 + ratio**8) ** (-1 / 8)
 
 
-class Resized(torch.nn.Module):
-    """A policy behind the pre-processing that both sides use.
-
-    Args:
-        policy: the network.
-        transforms: from the camera's planes to the network's.
-    """
-
-    def __init__(
-        self, policy: torch.nn.Module, transforms: Sequence[AbstractTransform]
-    ) -> None:
-        super().__init__()
-        self.policy, self.transforms = policy, transforms
-
-    def forward(self, planes: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
-        """Map planes (n, 3, height, width) and goals (n,) to controls (n,)."""
-        for transform in self.transforms:
-            planes = transform.apply(planes)
-        return self.policy(planes, goal)
-
-
 class TorchLoop:
     """A drive and its derivative by the texture.
 
@@ -227,6 +206,7 @@ class TorchLoop:
         view: what the policy sees.
         policy: maps images (n, 3, height, width) and goals (n,) to controls (n,);
             its parameters are frozen.
+        transforms: from the camera's planes to the policy's images.
         goal: of the route.
         vehicle: one control period.
         route: the objective's stage cost.
@@ -236,19 +216,24 @@ class TorchLoop:
         self,
         view: TorchView,
         policy: torch.nn.Module,
+        transforms: Sequence[AbstractTransform],
         goal: int,
         vehicle: TorchVehicle,
         route: TorchRoute,
     ) -> None:
         self.view, self.vehicle, self.route = view, vehicle, route
         self.policy, self.goal = policy.eval().requires_grad_(False), goal
+        self.transforms = transforms
 
     def drive(self, initial: torch.Tensor, horizon: int) -> torch.Tensor:
         """Drive from states (n, 3): (horizon, n, 3); taped if the texture asks."""
         goals = torch.full((len(initial),), self.goal)
         state, states = initial, []
         for _ in range(horizon):
-            control = self.policy(self.view.image(state.detach()), goals)
+            planes = self.view.image(state.detach())
+            for transform in self.transforms:
+                planes = transform.apply(planes)
+            control = self.policy(planes, goals)
             state = self.vehicle.step(state, control)
             states.append(state)
         return torch.stack(states)

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from bench.full_ngp import NGPData
-from bench.torch.encoding import AbstractHashGrid
+from bench.ngp_data import NGPData
+from bench.torch.encoding import HashGrid
 from bench.torch.window import TorchWindow
 
 BATCHES = ((0, 8), (8, 32), (32, 1 << 30))  # ranks of samples along a ray
@@ -67,7 +67,6 @@ class TorchNGP:
 
     Args:
         data: the field.
-        grid: the encoding, of the field's layout.
         stop: transmittance at which a ray ends.
 
     Attributes:
@@ -78,10 +77,10 @@ class TorchNGP:
         evaluated: samples in front of the end of their rays, counted up.
     """
 
-    def __init__(self, data: NGPData, grid: AbstractHashGrid, stop: float) -> None:
-        self.grid, self.limit = grid, -math.log(stop)
+    def __init__(self, data: NGPData, stop: float) -> None:
+        self.grid, self.limit = HashGrid(data.layout), -math.log(stop)
         self.batches: tuple[tuple[int, int], ...] = BATCHES
-        table = data.tensors["table"].reshape(grid.rows, grid.features)
+        table = data.tensors["table"].reshape(self.grid.rows, self.grid.features)
         self.parameters = {"table": _single(table)} | {
             name: _single(value)
             for name, value in data.tensors.items()
@@ -113,32 +112,28 @@ class TorchNGP:
         Returns:
             (n, 3) linear radiance.
         """
-        depth, radiance = torch.zeros(len(origin)), torch.zeros(len(origin), 3)
-        samples = self.samples(origin, direction, jitter)
-        harmonics = spherical_harmonics(direction)
-        for ranks in self.batches:
-            lit = self._lit(samples, harmonics, depth, ranks)
-            if lit is None:
-                break
-            radiance = radiance.index_add(0, lit.ray, lit.weight[:, None] * lit.colour)
-            depth = depth.index_add(0, lit.ray, lit.x)
-        return radiance + torch.exp(-depth)[:, None] * self.background(direction)
+        radiance, passed, _ = self.march(origin, direction, jitter)
+        return radiance + passed[:, None] * self.background(direction)
 
     def march(
-        self, origin: torch.Tensor, direction: torch.Tensor
+        self,
+        origin: torch.Tensor,
+        direction: torch.Tensor,
+        jitter: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """March rays, with all that a composite by depth needs.
 
         Args:
             origin: (n, 3), metres.
             direction: (n, 3), unit vectors.
+            jitter: as :meth:`render` takes it.
 
         Returns:
             premultiplied linear radiance (n, 3), transmittance (n,), and the depth
             times the opacity (n,), metres.
         """
         depth, seen = torch.zeros(len(origin)), torch.zeros(len(origin), 4)
-        samples = self.samples(origin, direction)
+        samples = self.samples(origin, direction, jitter)
         harmonics = spherical_harmonics(direction)
         for ranks in self.batches:
             lit = self._lit(samples, harmonics, depth, ranks)
@@ -198,18 +193,7 @@ class TorchNGP:
         start = torch.maximum(edges[:-1], near[:, None])  # (rays, intervals)
         end = torch.minimum(edges[1:], far[:, None])
         t = torch.lerp(start, end, 0.5 if jitter is None else jitter[:, None])
-        cell = torch.zeros(t.shape, dtype=torch.int32)
-        for axis, size in enumerate(self.occupied.shape):
-            place = start_unit[:, axis, None] + t * slope[:, axis, None]
-            cell = cell * size + (place * size).to(torch.int32).clamp_(0, size - 1)
-        occupied = self.occupied.reshape(-1).index_select(0, cell.reshape(-1))
-        kept = (occupied & (end > start).reshape(-1)).nonzero()[:, 0]
-        ray = kept // t.shape[1]
-        t, width = t.reshape(-1)[kept], (end - start).reshape(-1)[kept]
-        unit = (start_unit[ray] + t[:, None] * slope[ray]).clamp_(0.0, 1.0 - 1e-6)
-        each = torch.bincount(ray, minlength=len(origin))
-        rank = torch.arange(len(ray)) - (torch.cumsum(each, 0) - each)[ray]
-        return Samples(ray, rank, unit, width, t)
+        return occupied_samples(self.occupied, (start_unit, slope), t, end - start)
 
     def _lattice(self, index: torch.Tensor) -> torch.Tensor:
         """Return the distance of lattice points, metres."""
@@ -251,6 +235,35 @@ class TorchNGP:
                 y = (row.long() + dv).clamp(0, height - 1)
                 raw += (by_u * by_v)[:, None] * self.sky[y, x]
         return decode(raw)
+
+
+def occupied_samples(
+    cells: torch.Tensor,
+    rays: tuple[torch.Tensor, torch.Tensor],
+    t: torch.Tensor,
+    width: torch.Tensor,
+) -> Samples:
+    """Keep the intervals of rays in occupied cells.
+
+    Args:
+        cells: booleans (rx, ry, rz) of the unit box.
+        rays: origins and directions (rays, 3), in units of the box.
+        t: (rays, k) distances of the samples, metres.
+        width: (rays, k) of the intervals, metres; none where it is not positive.
+    """
+    start, slope = rays
+    cell = torch.zeros(t.shape, dtype=torch.int32)
+    for axis, size in enumerate(cells.shape):
+        place = start[:, axis, None] + t * slope[:, axis, None]
+        cell = cell * size + (place * size).to(torch.int32).clamp_(0, size - 1)
+    occupied = cells.reshape(-1).index_select(0, cell.reshape(-1))
+    kept = (occupied & (width > 0).reshape(-1)).nonzero()[:, 0]
+    ray = torch.div(kept, max(t.shape[1], 1), rounding_mode="floor")
+    t, width = t.reshape(-1)[kept], width.reshape(-1)[kept]
+    unit = (start[ray] + t[:, None] * slope[ray]).clamp_(0.0, 1.0 - 1e-6)
+    each = torch.bincount(ray, minlength=len(start))
+    rank = torch.arange(len(ray)) - (torch.cumsum(each, 0) - each)[ray]
+    return Samples(ray, rank, unit, width, t)
 
 
 def sum_before(x: torch.Tensor, ray: torch.Tensor) -> torch.Tensor:

@@ -8,7 +8,6 @@ rows and weights of the vertices around them, and what the sigmoid and the curve
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,8 +15,8 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from bench.full_ngp import level_sizes
-from bench.torch.ngp import BATCHES, decode, sum_before
+from bench.ngp_data import level_sizes
+from bench.torch.ngp import BATCHES, Samples, decode, occupied_samples, sum_before
 from bench.torch.window import TorchWindow
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.ngp import NGPLayout
@@ -93,44 +92,26 @@ class ObjectView:
     moment: torch.Tensor
 
 
-class AbstractLookup(ABC):
-    """Sum over all levels of a grid, interpolated from rows of a table."""
+def lookup(
+    table: torch.Tensor, row: torch.Tensor, weight: torch.Tensor
+) -> torch.Tensor:
+    """Sum over all levels of a grid, interpolated from rows of a table.
 
-    @abstractmethod
-    def __call__(
-        self, table: torch.Tensor, row: torch.Tensor, weight: torch.Tensor
-    ) -> torch.Tensor:
-        """Look up points.
+    On a GPU, `index_select` and a product of matrices are faster than a bag, which is
+    faster on a CPU.
 
-        Args:
-            table: (rows, k); the derivative by it is dense.
-            row: (n, 8 levels) int32.
-            weight: (n, 8 levels).
+    Args:
+        table: (rows, k); the derivative by it is dense.
+        row: (n, 8 levels) int32.
+        weight: (n, 8 levels).
 
-        Returns:
-            (n, k).
-        """
-
-
-class BagLookup(AbstractLookup):
-    """One `embedding_bag` of all corners of all levels."""
-
-    def __call__(
-        self, table: torch.Tensor, row: torch.Tensor, weight: torch.Tensor
-    ) -> torch.Tensor:
-        """See :meth:`AbstractLookup.__call__`."""
+    Returns:
+        (n, k).
+    """
+    if table.device.type == "cpu":
         return F.embedding_bag(row, table, mode="sum", per_sample_weights=weight)
-
-
-class SelectLookup(AbstractLookup):
-    """`index_select` and a product of matrices, one a point."""
-
-    def __call__(
-        self, table: torch.Tensor, row: torch.Tensor, weight: torch.Tensor
-    ) -> torch.Tensor:
-        """See :meth:`AbstractLookup.__call__`."""
-        values = table.index_select(0, row.reshape(-1)).view(*row.shape, table.shape[1])
-        return torch.bmm(weight[:, None], values)[:, 0]
+    values = table.index_select(0, row.reshape(-1)).view(*row.shape, table.shape[1])
+    return torch.bmm(weight[:, None], values)[:, 0]
 
 
 class TorchObject:
@@ -138,7 +119,6 @@ class TorchObject:
 
     Args:
         data: the object.
-        lookup: of densities and colours.
         stop: transmittance at which a ray ends.
 
     Attributes:
@@ -146,7 +126,7 @@ class TorchObject:
         evaluated: samples in front of the end of their rays, counted up.
     """
 
-    def __init__(self, data: ObjectData, lookup: AbstractLookup, stop: float) -> None:
+    def __init__(self, data: ObjectData, stop: float) -> None:
         levels, base, largest = map(int, data.levels)
         sizes = level_sizes(NGPLayout(levels, 4, 24, base, largest))
         slots = np.array([size for _, _, size in sizes])
@@ -155,7 +135,7 @@ class TorchObject:
             [(1, edge, edge * edge) for _, edge, _ in sizes], dtype=torch.int32
         )
         self.first = torch.tensor(np.cumsum(slots) - slots, dtype=torch.int32)
-        self.lookup, self.limit = lookup, -math.log(stop)
+        self.limit = -math.log(stop)
         self.density = torch.tensor(data.density)[:, None]
         self.texture = torch.tensor(data.texture)
         self.rotation = torch.tensor(data.to_world[:, :3], dtype=torch.float32)
@@ -178,15 +158,15 @@ class TorchObject:
         """
         with torch.no_grad():
             lit = self._lit(origin, direction)
-        colour = decode(self.lookup(self.texture, lit.row, lit.corner))
+        colour = decode(lookup(self.texture, lit.row, lit.corner))
         radiance = torch.zeros(len(lit.met), 3)
         radiance = radiance.index_add(0, lit.ray, lit.weight[:, None] * colour)
         return ObjectView(lit.met, radiance, torch.exp(-lit.depth), lit.moment)
 
     def _lit(self, origin: torch.Tensor, direction: torch.Tensor) -> _Lit:
         """Find the samples in front of the ends of their rays, and their weights."""
-        samples = self._samples(origin, direction)
-        depth, moment = torch.zeros(len(samples.met)), torch.zeros(len(samples.met))
+        met, samples = self._samples(origin, direction)
+        depth, moment = torch.zeros(len(met)), torch.zeros(len(met))
         parts = []
         for low, high in BATCHES:
             on = (samples.rank >= low) & (samples.rank < high)
@@ -195,7 +175,7 @@ class TorchObject:
                 break
             ray = samples.ray[chosen]
             row, corner = self._corners(samples.unit[chosen])
-            raw = self.lookup(self.density, row, corner)[:, 0]
+            raw = lookup(self.density, row, corner)[:, 0]
             x = self.density_scale * torch.exp(raw.clamp(max=15.0))
             x = x * samples.width[chosen] * self.window(samples.unit[chosen])
             before = depth[ray] + sum_before(x, ray)
@@ -213,10 +193,12 @@ class TorchObject:
             torch.cat(some) for some in zip(*parts, strict=True)
         )
         self.evaluated += len(ray)
-        return _Lit(samples.met, depth, moment, ray, row, corner, weight)
+        return _Lit(met, depth, moment, ray, row, corner, weight)
 
-    def _samples(self, origin: torch.Tensor, direction: torch.Tensor) -> _Samples:
-        """Make the lattice intervals of rays through the box, in occupied cells."""
+    def _samples(
+        self, origin: torch.Tensor, direction: torch.Tensor
+    ) -> tuple[torch.Tensor, Samples]:
+        """Return the rays that meet occupied cells (k,), and their samples."""
         turned = self.rotation / (self.size * self.extent)  # columns: to the unit box
         start = (origin - self.origin) @ turned - self.lower / self.extent
         slope = direction @ turned
@@ -233,20 +215,10 @@ class TorchObject:
             near, far = self.step * first, self.step * (first + count)
         begin = torch.maximum(index * self.step, near[:, None])
         end = torch.minimum((index + 1) * self.step, far[:, None])
-        t = 0.5 * (begin + end)
-        cell = torch.zeros(t.shape, dtype=torch.int32)
-        for axis, size in enumerate(self.cells.shape):
-            place = start[:, axis, None] + t * slope[:, axis, None]
-            cell = cell * size + (place * size).to(torch.int32).clamp_(0, size - 1)
-        occupied = self.cells.reshape(-1).index_select(0, cell.reshape(-1))
-        kept = (occupied & (end > begin).reshape(-1)).nonzero()[:, 0]
-        ray = torch.div(kept, max(t.shape[1], 1), rounding_mode="floor")
-        t, width = t.reshape(-1)[kept], (end - begin).reshape(-1)[kept]
-        unit = (start[ray] + t[:, None] * slope[ray]).clamp_(0.0, 1.0 - 1e-6)
-        met, ray = torch.unique_consecutive(ray, return_inverse=True)
-        each = torch.bincount(ray, minlength=len(met))
-        rank = torch.arange(len(ray)) - (torch.cumsum(each, 0) - each)[ray]
-        return _Samples(through[met], ray, rank, unit, width, t)
+        rays, t = (start, slope), 0.5 * (begin + end)
+        samples = occupied_samples(self.cells, rays, t, end - begin)
+        met, samples.ray = torch.unique_consecutive(samples.ray, return_inverse=True)
+        return through[met], samples
 
     def _corners(self, unit: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return rows of the table and weights, each (n, 8 levels)."""
@@ -263,27 +235,6 @@ class TorchObject:
 
     def _axes(self, key: torch.Tensor) -> zip[tuple[torch.Tensor, torch.Tensor]]:
         return zip(key.unbind(-1), self.factors.unbind(-1), strict=True)
-
-
-@dataclass
-class _Samples:
-    """Lattice intervals in occupied cells, ray by ray.
-
-    Attributes:
-        met: (k,) int64, the rays that have any.
-        ray: (n,) int64 into `met`, ascending.
-        rank: (n,) int64, position among the samples of the ray.
-        unit: (n, 3), in the unit box.
-        width: (n,), metres.
-        distance: (n,), metres from the ray's origin.
-    """
-
-    met: torch.Tensor
-    ray: torch.Tensor
-    rank: torch.Tensor
-    unit: torch.Tensor
-    width: torch.Tensor
-    distance: torch.Tensor
 
 
 @dataclass

@@ -4,12 +4,10 @@ import gymnasium
 import numpy as np
 from PIL import Image
 
-import mi_nerfattack.deploy.gym  # noqa: F401  registers the environments
-
 EPISODES, STEPS = 6, 50
 
 world = gymnasium.make(
-    "mi_nerfattack/surrogate-v0",
+    "mi_nerfattack.deploy.gym:mi_nerfattack/surrogate-v0",
     routes=["right"],
     max_steps=STEPS,
     render_mode="rgb_array",

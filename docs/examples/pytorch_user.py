@@ -6,7 +6,7 @@ import torch
 from torch import nn
 
 from mi_nerfattack import attack, policy, rollout, scenario, scenes
-from mi_nerfattack.vehicle.state import state_type
+from mi_nerfattack.vehicle.dynamics import state_type
 
 mi.set_variant("llvm_ad_rgb")
 HORIZON, ITERATIONS = 25, 4  # control periods of 0.1 s, steps of Adam

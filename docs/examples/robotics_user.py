@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack import deploy, policy, scenes, vehicle
-from mi_nerfattack.deploy.kinematic import Motion
+from mi_nerfattack.deploy.vehicle import Motion
 from mi_nerfattack.vehicle.expert import choose
 
 mi.set_variant("llvm_ad_rgb")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
@@ -15,7 +15,7 @@ from matplotlib.patches import FancyBboxPatch
 from mi_nerfattack.experiment.sweep.table import read_table
 from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, NO_OBJECT, RANDOM
 
-TABLE = Path(__file__).parents[1] / "table2/results.parquet"
+TABLE = Path(__file__).parents[1] / "table2/results.csv"
 LIMIT_M = 0.85  # beyond it a wheel is out of the lane: (3.5 m - 1.8 m) / 2
 BLACK, BLUE, ORANGE, GREY = "#222222", "#0072B2", "#D55E00", "#666666"
 # Text stays text, and a drawing that is made again is the same file.
@@ -71,22 +71,22 @@ def draw_chart(folder: Path, small: bool) -> None:
     figure.savefig(folder / "chart.png", dpi=40 if small else 100)
 
 
-def places_chart(rows: Sequence[dict[str, Any]]) -> Figure:
+def places_chart(table: pd.DataFrame) -> Figure:
     """Plot one mark per drive in deployment, by place, on a logarithmic axis.
 
     Args:
-        rows: of the table of a sweep; a place is a route and a seed.
+        table: of a sweep; a place is a route and a seed.
     """
-    driven = [row for row in rows if row["environment"] == "deployment"]
-    routes = dict.fromkeys(row["route"] for row in driven)
-    places = list(dict.fromkeys((row["route"], row["seed"]) for row in driven))
+    driven = table[table["environment"] == "deployment"]
+    number = driven.groupby(["route", "seed"], sort=False).ngroup()
+    places = list(driven[["route", "seed"]].drop_duplicates().itertuples(index=False))
+    routes = dict.fromkeys(driven["route"])
     with matplotlib.rc_context({"font.size": 11}):
         figure = Figure(figsize=(9, 3.8), facecolor="white", layout="constrained")
         axis = figure.add_subplot()
         for case, (label, marker, colour) in CASES.items():
-            marked = [row for row in driven if row["case"] == case]
-            x = [places.index((row["route"], row["seed"])) for row in marked]
-            y = [row["cross_track_mean_m"] for row in marked]
+            own = driven["case"] == case
+            x, y = number[own], driven.loc[own, "cross_track_mean_m"]
             style = {"s": 34, "color": colour, "marker": marker, "alpha": 0.75}
             axis.scatter(x, y, label=label, **style)
         axis.axhline(LIMIT_M, color=GREY, linestyle="--", linewidth=1)

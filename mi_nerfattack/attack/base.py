@@ -55,9 +55,11 @@ class AbstractAttack(ABC):
         best_mean_m: mean |e| of the same iteration, metres.
         best_offsets: (k, 6) object offsets of the same.
         whole: False while an update is half done, when the state must not be kept.
+        one_level: whether objects are marched as one level while they are optimised.
     """
 
     sweeps: ClassVar[int]
+    one_level: bool = False
 
     def __init__(
         self,
@@ -132,6 +134,11 @@ class AbstractAttack(ABC):
         first iteration.
         """
         return []
+
+    @property
+    def judged_objective(self) -> float:
+        """Least objective, as random looks are judged; once finished."""
+        return self.best_objective
 
     @property
     def best_is_judged(self) -> bool:

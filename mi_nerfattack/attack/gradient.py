@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import drjit as dr
@@ -19,10 +20,9 @@ from mi_nerfattack.attack.base import (
     history_tensors,
     read_history,
 )
-from mi_nerfattack.attack.freedom import Freedom, offset_gradients
-from mi_nerfattack.attack.schedule import Schedule
-from mi_nerfattack.attack.texture.colours import AbstractColouring
-from mi_nerfattack.backend.adam import adam_tensors, load_adam
+from mi_nerfattack.attack.freedom import Freedom, Schedule, offset_gradients
+from mi_nerfattack.attack.texture.colours import AbstractColouring, Colours
+from mi_nerfattack.backend.arrays import adam_tensors, load_adam
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.posed import move_all, offsets_of
 from mi_nerfattack.rollout.function import Evaluation, Rollout
@@ -50,6 +50,12 @@ class GradientAttack(AbstractAttack):
         initial: (m, n) initial states.
         freedom: what may change.
         schedule: of the learning rates; constant by default.
+        one_level: march objects as one level while they are optimised, see
+            `fields.one_level.OneLevel`.
+
+    Raises:
+        InputError: `one_level`, with a colouring that steps in other parameters than
+            the colours of a level.
     """
 
     sweeps = 2
@@ -61,17 +67,25 @@ class GradientAttack(AbstractAttack):
         initial: Any,
         freedom: Freedom | None = None,
         schedule: Schedule | None = None,
+        one_level: bool = False,
     ) -> None:
         freedom = freedom or Freedom()
         super().__init__(rollout, route, initial, freedom, differentiable(rollout.loop))
         self.schedule: Schedule = schedule or Schedule(sys.maxsize)
+        self.one_level = one_level
         self.optimiser: Adam = Adam(lr=1.0)
         self._colourings: dict[str, AbstractColouring] = {}
         self._best: Parameters = {}  # of the iteration with the least objective
         self._last: IterationRecord | None = None  # what the last update gave
+        self._exact: float | None = None  # objective of the best, with all levels
         if self.freedom.texture_rate is not None:
             for i, field in enumerate(self.sensor.fields):
                 colouring = self.freedom.colouring(field)
+                if one_level and not isinstance(colouring, Colours):
+                    raise InputError(
+                        f"one_level: {type(colouring).__name__} may step in all levels "
+                        "of a texture; leave one_level out, or step in Colours"
+                    )
                 self._colourings[str(i)] = colouring
                 self._best[str(i)] = colouring.start
                 self.optimiser[str(i)] = _tensor(colouring.start)
@@ -97,11 +111,12 @@ class GradientAttack(AbstractAttack):
         Raises:
             InputError: the gradient is not finite; nothing is updated.
         """
-        self._install()
-        evaluation = self.rollout.run(self.initial, on_step)
-        record = self._record(evaluation)
         moved = self.sensor.pose_keys if self.freedom.pose_rate is not None else ()
-        gradient = self.rollout.gradient(evaluation, moved, on_step=on_step)
+        with self._as_one_level():
+            self._install()
+            evaluation = self.rollout.run(self.initial, on_step)
+            record = self._record(evaluation)
+            gradient = self.rollout.gradient(evaluation, moved, on_step=on_step)
         values = self._values(gradient)
         self.whole = False
         self._update(values)
@@ -113,6 +128,14 @@ class GradientAttack(AbstractAttack):
         """See ``AbstractAttack.finish``."""
         self._last = self.measure()
         self.restore_best()
+        if self.one_level:
+            exact = self.rollout.measure(self.initial).value
+            self._exact = exact + self._penalty(self._best)
+
+    @property
+    def judged_objective(self) -> float:
+        """See ``AbstractAttack.judged_objective``."""
+        return self.best_objective if self._exact is None else self._exact
 
     def curve(self, backward_multiple: float) -> np.ndarray:
         """See ``AbstractAttack.curve``; once finished, the last update counts too.
@@ -129,8 +152,9 @@ class GradientAttack(AbstractAttack):
 
     def measure(self) -> IterationRecord:
         """Drive with the present parameters, so that the last update counts too."""
-        self._install()
-        return self._record(self.rollout.measure(self.initial))
+        with self._as_one_level():
+            self._install()
+            return self._record(self.rollout.measure(self.initial))
 
     @property
     def best(self) -> list[np.ndarray]:
@@ -155,14 +179,22 @@ class GradientAttack(AbstractAttack):
         return np.flatnonzero(~found).tolist()
 
     def judge_best(self, on_step: Callable[[int], None] | None = None) -> None:
-        """Measure the best parameters anew; costs one drive.
-
-        Args:
-            on_step: called after each control period.
-        """
+        """See `AbstractAttack.judge_best`."""
         self.restore_best()
         self.best_objective = np.inf
-        self._record(self.rollout.measure(self.initial, on_step), self._best)
+        with self._as_one_level():
+            self._record(self.rollout.measure(self.initial, on_step), self._best)
+
+    @contextmanager
+    def _as_one_level(self) -> Iterator[None]:
+        """March the objects as one level, if asked to."""
+        with ExitStack() as stack:
+            for i, field in enumerate(self.sensor.fields if self.one_level else ()):
+                colouring = self._colourings.get(str(i))
+                stepped = isinstance(colouring, Colours)
+                level = colouring.level if stepped else field.levels()[-1]
+                stack.enter_context(field.one_level(level))
+            yield
 
     def _values(self, gradient: Gradient) -> dict[str, Any]:
         """Return the gradient by the optimiser's keys, checked."""
@@ -214,6 +246,9 @@ class GradientAttack(AbstractAttack):
         values = {k: dr.detach(self.optimiser[k]) for k in self._colourings}
         return {key: value.numpy().copy() for key, value in values.items()}
 
+    def _penalty(self, colours: Parameters) -> float:
+        return sum(c.penalty(colours[key]) for key, c in self._colourings.items())
+
     def _textures(self, colours: Parameters) -> list[np.ndarray]:
         return [c.texture(colours[key]) for key, c in self._colourings.items()]
 
@@ -229,12 +264,7 @@ class GradientAttack(AbstractAttack):
         }
 
     def load_tensors(self, tensors: dict[str, np.ndarray]) -> None:
-        """Take over a state written by :meth:`tensors`, and install its best.
-
-        Raises:
-            InputError: the entries do not fit each other, or what is allowed.
-            KeyError: an entry is missing.
-        """
+        """See `AbstractAttack.load_tensors`."""
         self.history = read_history(tensors)
         self.best_mean_m = float(tensors["best_mean_m"][0])
         self.best_objective = float(tensors["best_objective"][0])
@@ -284,7 +314,7 @@ class GradientAttack(AbstractAttack):
         colours = self._colours() if colours is None else colours
         error = distances(self.route, seen)
         mean, value = float(error.mean()), seen.value
-        value += sum(c.penalty(colours[key]) for key, c in self._colourings.items())
+        value += self._penalty(colours)
         if value < self.best_objective:
             self._best = colours
             self.best_offsets = offsets_of(self.sensor.objects)

@@ -8,14 +8,120 @@ whole drive) or :class:`rollout.objective.Terminal` (at its end).
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import drjit as dr
+import numpy as np
 
-from mi_nerfattack.ranges import Positive, checked
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.ranges import Finite, Positive, SomeShare, checked
 from mi_nerfattack.rollout.objective import AbstractObjective, StateHistory
 from mi_nerfattack.vehicle.route.route import Route, smooth_absolute
+
+
+class AbstractWeights(ABC):
+    """Weights of the control periods of a drive."""
+
+    @abstractmethod
+    def of(self, horizon: int, dt: float) -> np.ndarray | None:
+        """Return (T,) float64, None for ones; entry t - 1 is of the state after t.
+
+        Args:
+            horizon: T, in control periods.
+            dt: control period, seconds.
+
+        Raises:
+            InputError: they do not fit the horizon.
+        """
+
+
+@dataclass(frozen=True)
+@checked()
+class Uniform(AbstractWeights):
+    """Ones."""
+
+    kind: Literal["uniform"] = "uniform"
+
+    def of(self, horizon: int, dt: float) -> None:
+        """Return None."""
+
+
+@dataclass(frozen=True)
+@checked()
+class Linear(AbstractWeights):
+    """Weigh late times more: ``t / T``, up to 1 at the end."""
+
+    kind: Literal["linear"] = "linear"
+
+    def of(self, horizon: int, dt: float) -> np.ndarray:
+        """Return the weights."""
+        return np.arange(1, horizon + 1) / horizon
+
+
+@dataclass(frozen=True)
+@checked("weights")
+class LastSeconds(AbstractWeights):
+    """Weigh the last `last_s` seconds, rounded to whole periods, with 1, else 0."""
+
+    last_s: Positive
+    kind: Literal["last"] = "last"
+
+    def of(self, horizon: int, dt: float) -> np.ndarray:
+        """Return the weights."""
+        count = round(self.last_s / dt)
+        if not 1 <= count <= horizon:
+            raise InputError(
+                f"weights.last_s: {self.last_s!r} s is {count} control periods of "
+                f"{dt!r} s; allowed are 1 to {horizon}, what the drive has"
+            )
+        return (np.arange(horizon) >= horizon - count).astype(np.float64)
+
+
+@dataclass(frozen=True)
+@checked("weights")
+class Discounted(AbstractWeights):
+    """Weigh early times more: ``d^((t - 1) dt)``, 1 at the first."""
+
+    discount_per_s: SomeShare  # d, the factor from one second to the next
+    kind: Literal["discount"] = "discount"
+
+    def of(self, horizon: int, dt: float) -> np.ndarray:
+        """Return the weights."""
+        return self.discount_per_s ** (dt * np.arange(horizon))
+
+
+@dataclass(frozen=True)
+@checked("weights")
+class Listed(AbstractWeights):
+    """Numbers of the user's, one a control period, not all zero."""
+
+    listed_weights: tuple[Finite, ...]
+    kind: Literal["listed"] = "listed"
+
+    def of(self, horizon: int, dt: float) -> np.ndarray:
+        """Return the weights."""
+        if len(self.listed_weights) != horizon:
+            raise InputError(
+                f"weights.listed_weights: {len(self.listed_weights)} numbers for a "
+                f"horizon of {horizon}; give one a control period"
+            )
+        if not any(self.listed_weights):
+            raise InputError("weights.listed_weights: zeros; must be not all zero")
+        return np.array(self.listed_weights, np.float64)
+
+
+@dataclass(frozen=True)
+@checked()
+class End(AbstractWeights):
+    """The last state alone."""
+
+    kind: Literal["end"] = "end"
+
+    def of(self, horizon: int, dt: float) -> np.ndarray:
+        """Return the weights."""
+        return np.eye(1, horizon, horizon - 1)[0]
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,16 @@ back ends the process.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from drjit.opt import Adam
+
+from mi_nerfattack.errors import InputError
 
 
 def concat(parts: Sequence[Any], counts: Sequence[int]) -> Any:
@@ -85,7 +88,7 @@ def upload(kind: Any, values: np.ndarray) -> Any:
     """
     number = np.dtype(dr.type_v(kind).name.lower())
     # the kernel runs later, so that NumPy has to copy, too
-    borrowed = kind(np.array(values, number).reshape(-1))
+    borrowed = kind(aligned(np.asarray(values, number)).reshape(-1))
     result = dr.empty(kind, values.size)
     # a gather of everything, or `dr.copy`, would return the same memory
     dr.scatter(result, borrowed, dr.arange(dr.uint32_array_t(kind), values.size))
@@ -93,7 +96,116 @@ def upload(kind: Any, values: np.ndarray) -> Any:
     return result
 
 
+def aligned(values: np.ndarray) -> np.ndarray:
+    """Copy an array into memory that begins at a multiple of 64 bytes.
+
+    Dr.Jit compiles one kernel for such memory and another for any other, and where
+    NumPy's begins is chance.
+    """
+    raw = np.empty(values.nbytes + 64, np.uint8)
+    start = -raw.ctypes.data % 64
+    copy = raw[start : start + values.nbytes].view(values.dtype).reshape(values.shape)
+    copy[...] = values
+    return copy
+
+
 def upload_rows(kind: Any, rows: np.ndarray) -> Any:
     """Return vectors of a type, such as `mi.Point3f`, from rows (n, m)."""
     column = dr.value_t(kind)
     return kind(*[column(values) for values in rows.T.tolist()])
+
+
+def adam_tensors(optimiser: Adam) -> dict[str, np.ndarray]:
+    """Return copies of parameters and moments.
+
+    Args:
+        optimiser: not one with AMSGrad, whose maxima are left out.
+
+    Returns:
+        for each parameter: ``value.NAME``, and the moments ``first.NAME`` and
+        ``second.NAME``, float32 in the parameter's shape; ``time.NAME``, (1,) uint32,
+        the number of steps.
+    """
+    result: dict[str, np.ndarray] = {}
+    state: dict[str, Any] = optimiser.state
+    for name, (value, _, _, (time, first, second, _)) in state.items():
+        for part, array in (("value", value), ("first", first), ("second", second)):
+            flat = np.array(dr.detach(array), np.float32)
+            result[f"{part}.{name}"] = flat.reshape(value.shape)
+        result[f"time.{name}"] = np.array([time[0]], np.uint32)
+    return result
+
+
+def load_adam(
+    optimiser: Adam,
+    tensors: dict[str, np.ndarray],
+    names: Iterable[str] | None = None,
+) -> None:
+    """Load what :func:`adam_tensors` returned; keep the learning rates.
+
+    Args:
+        optimiser: has the parameters already.
+        tensors: the arrays; they are copied.
+        names: of the parameters to load; all by default.
+
+    Raises:
+        InputError: an array has another shape than the parameter.
+        KeyError: an array is missing.
+    """
+    state: dict[str, Any] = optimiser.state
+    for name in list(state if names is None else names):
+        value, promoted, rate, (time, first, _, largest) = state[name]
+        shapes = {part: value.shape for part in ("value", "first", "second")}
+        for part, shape in {**shapes, "time": (1,)}.items():
+            if (actual := tensors[f"{part}.{name}"].shape) != shape:
+                raise InputError(
+                    f"{part}.{name}: shape {actual}; the parameter has {shape}"
+                )
+        # copies, because Dr.Jit would share memory with NumPy
+        arrays = [np.array(tensors[f"{part}.{name}"], np.float32) for part in shapes]
+        fresh = type(value)(arrays[0])
+        moments = [type(first)(array.ravel()) for array in arrays[1:]]
+        dr.make_opaque(fresh, moments)
+        dr.enable_grad(fresh)
+        # a literal, as Adam itself counts, so that the same kernel does the next step
+        steps = type(time)(int(tensors[f"time.{name}"][0]))
+        state[name] = fresh, promoted, rate, (steps, *moments, largest)
+
+
+def differentiates_rays(integrator: Any) -> bool:
+    """Tell whether an integrator has the protocol of Mitsuba's `RBIntegrator`.
+
+    By the name of its base class: other packages and changes of variant leave several
+    copies of that class in a process.
+    """
+    return any(base.__name__ == "RBIntegrator" for base in type(integrator).__mro__)
+
+
+def vjp(f: Callable[[Any], Any], x: Any, dy: Any) -> Any:
+    """Multiply a cotangent by the derivative of a function (reverse mode).
+
+    The function is evaluated again, with gradients even where the caller suspended
+    them. Other arrays that `f` reads get their gradients, too, if they are attached.
+
+    Args:
+        f: maps a PyTree of arrays to a PyTree of arrays.
+        x: where to differentiate; itself stays detached or attached as it is.
+        dy: cotangent of ``f(x)``, of the same structure; a number stands for equal
+            entries.
+
+    Returns:
+        cotangent of `x`, of its structure and shapes; detached, not evaluated.
+
+    Raises:
+        ValueError: ``f(x)`` does not depend on `x`.
+    """
+    with dr.resume_grad():
+        leaf = dr.detach(x)
+        dr.enable_grad(leaf)
+        y = f(leaf)
+        if not dr.grad_enabled(y):
+            raise ValueError("vjp: the result does not depend on the argument")
+        dr.accum_grad(y, dy)  # not set: two entries of y may be one variable
+        dr.enqueue(dr.ADMode.Backward, y)
+        dr.traverse(dr.ADMode.Backward)
+        return dr.grad(leaf)

@@ -21,15 +21,21 @@ from mi_nerfattack.errors import SetupError
 
 
 @contextmanager
-def deterministic() -> Iterator[None]:
+def deterministic(wanted: bool = True) -> Iterator[None]:
     """Let equal input give equal bits: kernels, BLAS and torch on one thread.
 
     What differs from run to run otherwise is the order in which threads add gradients
     up; torch also refuses operations without a deterministic implementation.
 
+    Args:
+        wanted: whether; otherwise nothing is changed.
+
     Raises:
         SetupError: the variant runs on a GPU, which sums in any order.
     """
+    if not wanted:
+        yield
+        return
     if dr.backend_v(mi.Float) != dr.JitBackend.LLVM:
         raise SetupError(
             f"deterministic: variant {mi.variant()} adds gradients in any order; set "

@@ -69,10 +69,11 @@ def _watch(
 
 
 @contextmanager
-def held_interrupts() -> Iterator[Callable[[], None]]:
+def held_interrupts(*, all_of_them: bool = False) -> Iterator[Callable[[], None]]:
     """Hold Ctrl-C and SIGTERM back; what is yielded raises them.
 
-    A second signal is not held back. Only signals with a handler in Python that raises
+    A second signal is held back only with `all_of_them`, for what soon ends and
+    cannot be left half done. Only signals with a handler in Python that raises
     KeyboardInterrupt are held, and only in the main thread, where they arrive.
 
     Yields:
@@ -102,7 +103,7 @@ def held_interrupts() -> Iterator[Callable[[], None]]:
         try:
             before[number](number, frame)
         except KeyboardInterrupt:
-            if came:
+            if came and not all_of_them:
                 raise
             came.append(number)
 

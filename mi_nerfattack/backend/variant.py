@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import logging
 import os
 import sys
-
-import mitsuba as mi
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import Any
 
 from mi_nerfattack.backend import llvm
 from mi_nerfattack.backend.interrupts import held_interrupts
@@ -30,6 +32,8 @@ def ensure() -> str:
         SetupError: the variant is unknown, the plugins do not run in it, or its
             backend (LLVM, CUDA) is missing or too old.
     """
+    import mitsuba as mi
+
     name = mi.variant()
     if name is None:
         name = os.environ.get(VARIABLE, DEFAULT)
@@ -45,6 +49,8 @@ def ensure() -> str:
 
 def usable() -> list[str]:
     """Name the variants of this Mitsuba that the plugins run in."""
+    import mitsuba as mi
+
     return [name for name in mi.variants() if obstacle(name) is None]
 
 
@@ -63,14 +69,63 @@ def obstacle(name: str) -> str | None:
 
 
 def install() -> None:
-    """Register the plugins now if a variant is set, and after every change."""
+    """Register the plugins if a variant is set, and after every change.
+
+    Where nobody has imported Mitsuba, this waits until somebody does.
+    """
+    if sys.modules.get("mitsuba") is not None:
+        _follow_changes()
+    elif _waiting not in sys.meta_path:
+        sys.meta_path.insert(0, _waiting)
+
+
+def _follow_changes() -> None:
+    import mitsuba as mi
+
     mi.detail.add_variant_callback(_on_change)
     current = mi.variant()
     if current is not None:
         _on_change(None, current)
 
 
+class _WaitsForMitsuba(MetaPathFinder):
+    """Lets the other finders find Mitsuba, and acts once it has been imported."""
+
+    _is_asking = False
+
+    def find_spec(self, fullname: str, *place: Any) -> ModuleSpec | None:
+        """Find Mitsuba, with a loader that ends the wait."""
+        del place
+        if fullname != "mitsuba" or self._is_asking:
+            return None
+        self._is_asking = True
+        try:
+            spec = importlib.util.find_spec(fullname)
+        finally:
+            self._is_asking = False
+        loader: Any = spec and spec.loader
+        if loader is not None:
+            execute = loader.exec_module
+
+            def exec_module(module: ModuleType) -> None:
+                with held_interrupts(all_of_them=True):  # half of Mitsuba aborts
+                    execute(module)
+                del loader.exec_module
+                if self in sys.meta_path:
+                    # another list, for a thread may be in the midst of this one
+                    sys.meta_path = [item for item in sys.meta_path if item is not self]
+                    _follow_changes()
+
+            loader.exec_module = exec_module
+        return spec
+
+
+_waiting = _WaitsForMitsuba()
+
+
 def _check_name(name: str) -> None:
+    import mitsuba as mi
+
     if name not in mi.variants():
         raise SetupError(
             f"{VARIABLE}: unknown variant {name!r}; allowed: {', '.join(usable())}"

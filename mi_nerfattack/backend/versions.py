@@ -17,7 +17,7 @@ from mi_nerfattack.backend import llvm, variant
 from mi_nerfattack.errors import SetupError
 
 #: Folders that show results or steer a real car; no result depends on them.
-_INERT = ("commands", "report", "robot")
+_INERT = ("commands", "report", "car")
 #: Packages that lie beside ours in a checkout, and in it when it is installed.
 _ELSEWHERE = ("plugins", "scenes")
 
@@ -57,7 +57,7 @@ def digest_code(places: Mapping[str, Path]) -> str:
 
     Args:
         places: folders by what the names of their modules begin with; of the first,
-            `commands`, `report`, `robot` and the other folders do not count.
+            `commands`, `report`, `car` and the other folders do not count.
 
     Raises:
         SetupError: a folder has no Python files.

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_nerfattack.capture.transforms import find_transforms, read_pose
+from mi_nerfattack.capture.transforms import find_transforms, read_frames
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.io.video import check_fps
@@ -39,10 +39,7 @@ def read_path(path: str | Path) -> np.ndarray:
             f"{source}: frames: missing or empty; a camera path is a list of "
             '{"transform_matrix": 4 x 4 numbers}'
         )
-    for i, frame in enumerate(frames):
-        if not isinstance(frame, dict):
-            raise InputError(f"{source}: frames[{i}]: {frame!r}; needs an object")
-    return np.stack([read_pose(source, i, frame) for i, frame in enumerate(frames)])
+    return read_frames(source, dict(enumerate(frames)))
 
 
 def route_path(route: Route, mount: CameraMount, fps: float) -> np.ndarray:

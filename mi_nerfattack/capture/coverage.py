@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.render.camera.projection import project
 
 FAR_DEG = 5.0
 """Gap (see `view_gaps`) beyond which a field is much worse between views than in them:
@@ -27,7 +28,7 @@ def view_gaps(
     At a point, the angle between the rays of two views tells how much of what one shows
     of its surroundings the other has seen, too. Of the points in a picture, the median
     of the angles to the nearest other view that has the point in its picture; 180 where
-    none has, and for a view without points. Occlusion and distortion are left out.
+    none has, and for a view without points. Occlusion is left out.
 
     Args:
         cameras: n intrinsics.
@@ -39,7 +40,7 @@ def view_gaps(
         (n,), degrees.
     """
     eyes = camera_to_world[:, :3, 3]
-    shown = _shown(cameras, camera_to_world, points)
+    shown = points_shown(cameras, camera_to_world, points)
     usable = np.ones(len(cameras), bool) if others is None else others
     return np.array([_gap(i, eyes, shown, usable, points) for i in range(len(cameras))])
 
@@ -58,7 +59,7 @@ def nearest_points(
         (n,), metres: 99 % of the points in a picture are farther away, as structure
         from motion has outliers; 0 where there are fewer than 100.
     """
-    shown = _shown(cameras, camera_to_world, points)
+    shown = points_shown(cameras, camera_to_world, points)
     found = np.zeros(len(cameras))
     for i in np.flatnonzero(shown.sum(1) >= _ENOUGH):
         away = np.linalg.norm(points[shown[i]] - camera_to_world[i, :3, 3], axis=1)
@@ -66,16 +67,14 @@ def nearest_points(
     return found
 
 
-def _shown(
+def points_shown(
     cameras: Sequence[Camera], camera_to_world: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
-    """Tell which points (m, 3) each pinhole's picture has, (n, m)."""
+    """Tell which points (m, 3) each picture has, (n, m)."""
     found = []
     for camera, pose in zip(cameras, camera_to_world, strict=True):
-        x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).T
-        u, v = camera.fx * x + camera.cx * z, camera.fy * y + camera.cy * z
-        inside = (u >= 0) & (u < camera.width * z) & (v >= 0) & (v < camera.height * z)
-        found.append((z > 0) & inside)
+        local = (points - pose[:3, 3]) @ pose[:3, :3]
+        found.append(project(camera, local)[1])
     return np.stack(found)
 
 

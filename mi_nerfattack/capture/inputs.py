@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,21 +10,24 @@ from typing import Any
 import numpy as np
 
 from mi_nerfattack.capture.posed_images import PosedImages, stacked
-from mi_nerfattack.capture.transforms import FILE_NAMES, find_transforms, read_table
-from mi_nerfattack.errors import InputError
-from mi_nerfattack.io import files
-from mi_nerfattack.render.camera.intrinsics import (
-    Camera,
-    generate_rays,
-    pose_arrays,
-    ray_lengths,
+from mi_nerfattack.capture.transforms import (
+    FILE_NAMES,
+    find_transforms,
+    named_path,
+    read_table,
 )
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import exr, files
+from mi_nerfattack.render.camera.intrinsics import Camera, ray_lengths
+from mi_nerfattack.render.camera.lens import generate_rays, pose_arrays
 
 _CUBE = 2.0  # half edge of the cube, in distances of the farthest camera
 _MARGIN = 0.01  # around the box of all depth points, of its longest edge
 _MIN_MARGIN_M = 0.05
 _FAR_MARGIN = 1 / 128  # of the largest depth: what an NGP's march steps there
 _MILLIMETRE = 1e-3
+_FAR_M = 300.0  # a median depth that no photograph of a place has, but its millimetres
+_NOTHING_M = 1e9  # from here on, depth stands for no surface, as Blender's 1e10
 _POINTS_PERCENT = 2.0  # of the points on either side of each axis are outliers
 _POINTS_MARGIN = 0.1  # around the box of points and cameras, of its longest edge
 
@@ -33,8 +37,10 @@ def read_depth(folder: str | Path, images: PosedImages) -> np.ndarray | None:
 
     Either ``depth_file``, our own: a safetensors file with the tensor ``depth``, a map
     for each frame, metres along the ray; or nerfstudio's ``depth_file_path`` of each
-    frame: a PNG of 16 bits, millimetres along the optical axis, 0 where unknown. A map
-    may be larger or smaller than its image; the nearest value is taken.
+    frame, along the optical axis: whole millimetres as PNG of 16 bits or ``.npy``, or
+    metres as EXR or ``.npy`` of real numbers; unknown where it is 0 or less or NaN, and
+    without a surface beyond a million kilometres. A map may be larger or smaller than
+    its image; the nearest value is taken.
 
     Args:
         folder: the folder of `transforms.json`, or the JSON file; any other folder has
@@ -51,8 +57,9 @@ def read_depth(folder: str | Path, images: PosedImages) -> np.ndarray | None:
             frame, or a depth is not positive.
     """
     path = Path(folder)
-    if path.is_dir() and not any((path / name).is_file() for name in FILE_NAMES):
-        return None
+    with files.reported(path):
+        if path.is_dir() and not any((path / name).is_file() for name in FILE_NAMES):
+            return None
     source = find_transforms(path)
     table, frames = read_table(source)
     used = _frames_of(source, frames, images)
@@ -82,7 +89,7 @@ def _frames_of(source: Path, frames: Sequence[Any], images: PosedImages) -> list
 def _read_own(
     source: Path, name: Any, n_frames: int, used: list[int], images: PosedImages
 ) -> np.ndarray:
-    where = source.parent / _path(source, "depth_file", name)
+    where = named_path(source, "depth_file", name)
     depth = files.read_safetensors(where)[0].get("depth")
     if depth is None or depth.ndim != 3 or len(depth) != n_frames:
         shape = None if depth is None else depth.shape
@@ -107,21 +114,65 @@ def _read_axial(
     camera = images.camera_of(index)
     if name is None:
         return np.full((camera.height, camera.width), np.nan, np.float32)
-    where = _path(source, f"frames[{frame}].depth_file_path", name)
-    if Path(where).suffix.lower() != ".png":
+    where = named_path(source, f"frames[{frame}].depth_file_path", name)
+    reader = _AXIAL.get(where.suffix.lower())
+    if reader is None:
         raise InputError(
             f"{source}: frames[{frame}].depth_file_path: {name!r}; must be a PNG of 16 "
-            "bits, millimetres"
+            "bits (millimetres), an EXR or .npy file (metres)"
         )
-    axial = _at_pixels(files.read_image16(source.parent / where), camera) * _MILLIMETRE
+    stored = _at_pixels(reader(where), camera)
+    axial = stored.astype(np.float64)
+    axial *= _MILLIMETRE if stored.dtype.kind in "ui" else 1
+    seen = axial[(axial > 0) & (axial < _NOTHING_M)]
+    if seen.size and (middle := np.median(seen)) > _FAR_M:
+        raise InputError(
+            f"{where}: half of the depths are beyond {middle:.0f} m; "
+            "real numbers are metres here, and millimetres in nerfstudio by default: "
+            "divide them by 1000"
+        )
     depth = np.where(axial > 0, axial * ray_lengths(camera), np.nan)
-    return depth.astype(np.float32)
+    return np.where(axial > _NOTHING_M, np.inf, depth).astype(np.float32)
 
 
-def _path(source: Path, field: str, name: Any) -> str:
-    if not isinstance(name, str) or not name:
-        raise InputError(f"{source}: {field}: {name!r}; needs a path")
-    return name.replace("\\", "/")
+def _read_exr(path: Path) -> np.ndarray:
+    """Read the depth (h, w) of an EXR file, metres: its Z, or its only channel."""
+    layers = exr.read_layers(path)[0]
+    maps = {name: layer for name, layer in layers.items() if layer.ndim == 2}
+    named = [name for name in maps if name.rpartition(".")[2] == "Z"] or list(maps)
+    if len(named) != 1:
+        raise InputError(
+            f"{path}: layers {', '.join(map(repr, layers))}; depth is a channel Z, or "
+            "the only channel"
+        )
+    return maps[named[0]]
+
+
+def _read_npy(path: Path) -> np.ndarray:
+    """Read a NumPy file of one plane of numbers, (height, width)."""
+    raw = io.BytesIO(files.read_bytes(path, files.MAX_IMAGE_BYTES))
+    try:
+        version = np.lib.format.read_magic(raw)
+        older = version == (1, 0)
+        form = np.lib.format
+        read = form.read_array_header_1_0 if older else form.read_array_header_2_0
+        shape, by_columns, kind = read(raw)
+        if kind.kind not in "uif" or len([n for n in shape if n != 1]) > 2:
+            raise ValueError(f"{kind} {shape}; needs numbers (height, width)")
+        data = raw.read()
+        flat = np.frombuffer(data, kind, int(np.prod(shape, dtype=object)))
+        array = flat.reshape(shape, order="F" if by_columns else "C")
+        while array.ndim > 2:
+            array = array.squeeze(array.shape.index(1))
+        if array.ndim != 2:
+            raise ValueError(f"{shape}; needs (height, width)")
+        return array
+    # a damaged header makes NumPy raise whatever its parser stumbles over
+    except Exception as err:
+        raise InputError(f"{path}: not a NumPy file of a plane ({err})") from err
+
+
+_AXIAL = {".png": files.read_image16, ".exr": _read_exr, ".npy": _read_npy}
 
 
 def _at_pixels(values: np.ndarray, camera: Camera) -> np.ndarray:

@@ -24,8 +24,7 @@ def read_cameras(
 ) -> tuple[Camera, ...]:
     """Build the cameras of all frames.
 
-    Reads `camera_model, w, h, fl_x, fl_y, cx, cy, camera_angle_x, camera_angle_y, k1,
-    k2, p1, p2` and nerfstudio's `distortion_params`.
+    Reads the keys `_KEYS`, k3 and k4 of a fisheye alone.
 
     Args:
         source: the JSON file, for messages.
@@ -46,46 +45,46 @@ def read_cameras(
         is_own = any(key in frame for key in _KEYS)
         where = f"{source}: frames[{index}]" if is_own else str(source)
         merged = {**table, **frame}
-        _check_model(where, merged)
-        values = _numbers(where, merged)
+        is_fisheye = _is_fisheye(where, merged)
+        values = _numbers(where, merged, is_fisheye)
         if not cameras:
             _check_first_size(where, values, image_shape)
-        key = tuple(values.values())
+        key = (is_fisheye, *values.values())
         if key not in known:
-            known[key] = _camera(where, values, image_shape)
+            known[key] = _camera(where, values, image_shape, is_fisheye)
         cameras.append(known[key])
     return tuple(cameras)
 
 
-def intrinsics_table(camera: Camera) -> dict[str, float]:
+def intrinsics_table(camera: Camera) -> dict[str, Any]:
     """Return the keys of a `transforms.json`, or of one of its frames."""
+    model = "OPENCV_FISHEYE" if camera.is_fisheye else "OPENCV"
     return {
+        "camera_model": model,
         "w": camera.width,
         "h": camera.height,
         "fl_x": camera.fx,
         "fl_y": camera.fy,
         "cx": camera.cx,
         "cy": camera.cy,
-        "k1": camera.k1,
-        "k2": camera.k2,
-        "p1": camera.p1,
-        "p2": camera.p2,
+        **{name: getattr(camera, name) for name in COLMAP_MODELS[model][4:]},
         "camera_angle_x": 2 * math.atan(0.5 * camera.width / camera.fx),
     }
 
 
-def _check_model(where: str, merged: Mapping[str, Any]) -> None:
+def _is_fisheye(where: str, merged: Mapping[str, Any]) -> bool:
     model = merged.get("camera_model", "OPENCV")
-    is_known = isinstance(model, str) and model in COLMAP_MODELS
-    if not is_known or merged.get("is_fisheye"):
+    if not isinstance(model, str) or model not in COLMAP_MODELS:
         raise InputError(
-            f"{where}: camera_model: {model!r}, is_fisheye: "
-            f"{merged.get('is_fisheye', False)!r}; only {', '.join(COLMAP_MODELS)} "
+            f"{where}: camera_model: {model!r}; only {', '.join(COLMAP_MODELS)} "
             "can be read; undistort the images first"
         )
+    return model == "OPENCV_FISHEYE" or bool(merged.get("is_fisheye"))
 
 
-def _numbers(where: str, merged: Mapping[str, Any]) -> dict[str, float | None]:
+def _numbers(
+    where: str, merged: Mapping[str, Any], is_fisheye: bool
+) -> dict[str, float | None]:
     values = {key: _number(where, key, merged.get(key)) for key in _NUMBERS}
     lens = merged.get("distortion_params")
     if lens is not None:
@@ -96,17 +95,23 @@ def _numbers(where: str, merged: Mapping[str, Any]) -> dict[str, float | None]:
             )
         for key, value in zip(_LENS, lens, strict=True):
             values[key] = _number(where, f"distortion_params, {key}", value)
-    for key in ("k3", "k4"):
-        if values[key]:
+    for key in ("k3", "k4", "k5", "k6"):
+        if (value := merged.get(key) or values.get(key)) and not (
+            is_fisheye and key in ("k3", "k4")
+        ):
             raise InputError(
-                f"{where}: {key}: {values[key]}; only k1, k2, p1, p2 are supported; "
-                "calibrate with four coefficients or undistort the images"
+                f"{where}: {key}: {value}; only k1, k2, p1, p2 are supported, and of "
+                "a fisheye k1 to k4; calibrate with four coefficients or undistort "
+                "the images"
             )
     return values
 
 
 def _camera(
-    where: str, values: Mapping[str, float | None], image_shape: tuple[int, ...]
+    where: str,
+    values: Mapping[str, float | None],
+    image_shape: tuple[int, ...],
+    is_fisheye: bool,
 ) -> Camera:
     width = _size(where, "w", values["w"], image_shape[1])
     height = _size(where, "h", values["h"], image_shape[0])
@@ -119,7 +124,8 @@ def _camera(
             fl_y,
             _or(values["cx"], 0.5 * width),
             _or(values["cy"], 0.5 * height),
-            *(_or(values[key], 0.0) for key in ("k1", "k2", "p1", "p2")),
+            *(_or(values[key], 0.0) for key in ("k1", "k2", "p1", "p2", "k3", "k4")),
+            is_fisheye=is_fisheye,
         )
     except InputError as error:
         raise InputError(f"{where}: {error}") from error

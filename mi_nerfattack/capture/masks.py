@@ -102,13 +102,13 @@ def stage_masks(
         InputError: a mask is not as large as its photograph or leaves nothing of it, or
             the folder has none, or one that belongs to no photograph.
     """
-    if not masks.exists():
-        raise InputError(
-            f"{masks}: does not exist; give a folder of masks, or a PNG for all"
-        )
+    with files.reported(masks):
+        masks.stat()
+        is_folder = masks.is_dir()
+        inside = list(masks.iterdir()) if is_folder else []
     found = {name: masks for name in names}
-    if masks.is_dir():
-        given = {p.name for p in masks.iterdir() if p.suffix.lower() == SUFFIX}
+    if is_folder:
+        given = {p.name for p in inside if p.suffix.lower() == SUFFIX}
         found = {n: masks / (n + SUFFIX) for n in names if n + SUFFIX in given}
         strays = sorted(given - {path.name for path in found.values()})
         if strays or not found:

@@ -16,13 +16,8 @@ from mi_nerfattack.capture.mesh.mesh import TexturedMesh, mitsuba_shapes
 from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Share, checked
-from mi_nerfattack.render.camera.intrinsics import (
-    Camera,
-    from_fov,
-    generate_rays,
-    look_at,
-    pose_arrays,
-)
+from mi_nerfattack.render.camera.intrinsics import Camera, from_fov, look_at
+from mi_nerfattack.render.camera.lens import generate_rays, pose_arrays
 from mi_nerfattack.render.pathtrace.views import iterate_views
 
 _FOV_DEG = 40.0

@@ -64,13 +64,11 @@ class Placement:
         mesh = load_mesh(path, self.up).turned(self.turn_deg)
         return normalise(mesh, self.height_m, self.longest_m)
 
-    def cube(self, edge_m: float | None, faces: Path | None) -> TexturedMesh:
+    def cube(self, edge_m: float, faces: Path | None) -> TexturedMesh:
         """Make a cube; its pictures lie in the folder `faces` as px.png and so on.
 
         Opacity of the pictures is ignored: a cube is solid.
         """
-        if edge_m is None:
-            raise InputError("--edge-m: is missing; a cube needs its edge in metres")
         pictures = None
         if faces is not None:
             pictures = {

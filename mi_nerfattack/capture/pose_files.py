@@ -12,7 +12,7 @@ import csv
 import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mi_nerfattack.capture.intrinsics import read_cameras
-from mi_nerfattack.capture.transforms import read_pose, read_table
+from mi_nerfattack.capture.transforms import read_frames, read_table
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
+from mi_nerfattack.io.positions import require_near
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix
 
 SUFFIXES = (".csv", ".toml", ".json")
@@ -85,16 +86,13 @@ def _read_json(path: Path, image_shape: tuple[int, ...] | None) -> PoseTable:
     if table.get("units") == "arbitrary":
         raise InputError(
             f"{path}: units: 'arbitrary'; a drive is replayed in metres: tell "
-            "'mi-nerfattack capture' the scale by --marker-m, --distance or "
-            "--metres-per-unit"
+            "'mi-nerfattack capture photographs' the scale by --marker-m, --distance "
+            "or --metres-per-unit"
         )
-    for index, frame in enumerate(frames):
-        if not isinstance(frame, dict):
-            raise InputError(f"{path}: frames[{index}]: {frame!r}; needs an object")
-    poses = np.stack([read_pose(path, i, frame) for i, frame in enumerate(frames)])
+    numbered = dict(enumerate(frames))
+    poses = read_frames(path, numbered)
     camera = None
     if image_shape is not None:
-        numbered = dict(enumerate(frames))
         cameras = set(read_cameras(path, table, numbered, image_shape))
         if len(cameras) > 1:
             raise InputError(
@@ -151,6 +149,7 @@ def _from_rows(
                 f"{where}: no pose; needs {', '.join(VEHICLE_KEYS)} of the vehicle or "
                 f"{', '.join(CAMERA_KEYS)} of the camera"
             )
+    require_near(path, np.stack(poses)[:, :3, 3])
     names = _names(path, rows, "file")
     return PoseTable(path, np.stack(poses), _times(path, rows), names, camera)
 
@@ -210,18 +209,22 @@ def _camera(path: Path, table: Any) -> Camera | None:
     where = f"{path}: camera"
     if not isinstance(table, dict):
         raise InputError(f"{where}: needs a [camera] table")
-    known = ("width", "height", "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+    known = [field.name for field in fields(Camera)]
     wrong = set(table) - set(known) | set(known[:6]) - set(table)
     if wrong:
         raise InputError(
             f"{where}: {', '.join(sorted(wrong))}; needs {', '.join(known[:6])}, and "
             f"may have {', '.join(known[6:])}"
         )
-    values = {key: _number(where, key, value) for key, value in table.items()}
+    is_fisheye = table.get("is_fisheye", False)
+    if not isinstance(is_fisheye, bool):
+        raise InputError(f"{where}: is_fisheye: {is_fisheye!r}; must be true or false")
+    numbers = {key: value for key, value in table.items() if key != "is_fisheye"}
+    values = {key: _number(where, key, value) for key, value in numbers.items()}
     size = [values.pop(key) for key in ("width", "height")]
     if any(value != int(value) for value in size):
         raise InputError(f"{where}: width, height: {size}; must be whole numbers of px")
     try:
-        return Camera(int(size[0]), int(size[1]), **values)
+        return Camera(*map(int, size), **values, is_fisheye=is_fisheye)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

@@ -60,7 +60,6 @@ class PosedImages:
     masks: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        """Check shapes and poses."""
         n = len(self.images)
         if not n:
             raise InputError("images: none; give at least one")
@@ -113,7 +112,6 @@ class PosedImages:
         return self.cameras[index] if self.cameras else self.camera
 
     def __len__(self) -> int:
-        """Return the number of images."""
         return len(self.images)
 
 

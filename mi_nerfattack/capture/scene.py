@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +13,28 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.backend.colour import linear_to_uint8
-from mi_nerfattack.capture.transforms import begin_posed, write_poses
+from mi_nerfattack.backend.versions import versions
+from mi_nerfattack.capture.transforms import FILE_NAMES, begin_posed, write_poses
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
+from mi_nerfattack.io.resumable import Record, Unit, differences, flatten, refuse
+from mi_nerfattack.render.camera.conventions import to_colmap
 from mi_nerfattack.render.camera.intrinsics import (
     Camera,
     CameraMount,
     mount_matrix,
 )
-from mi_nerfattack.render.pathtrace.load import load_scene
-from mi_nerfattack.render.pathtrace.views import iterate_views, require_colour
+from mi_nerfattack.render.pathtrace.ground import (
+    arc_lengths,
+    ground_findings,
+    wall_findings,
+)
+from mi_nerfattack.render.pathtrace.load import load_scene, named_files
+from mi_nerfattack.render.pathtrace.views import (
+    ViewRenderer,
+    require_colour,
+    view_seeds,
+)
 from mi_nerfattack.vehicle.route.route import Route, load_routes
 
 #: In widths of a lane: 0.9 m, and 1.5 m beside the lane or beyond its ends, of 3.5 m.
@@ -28,6 +43,10 @@ _BESIDE_SHARE = 0.4
 _HEADING_SD_DEG, _ANY_HEADING_SHARE = 15.0, 0.3
 _OTHER_HEIGHT_SHARE, _PITCH_SD_DEG = 0.3, 6.0
 _HEIGHTS = 4 / 7, 15 / 7  # in heights of the camera: 0.8 to 3 m, of 1.4 m
+_FORMAT = "mi_nerfattack captured view 1"
+_IDENTITY = "capture"  # key of transforms.json
+_VIEWS = "views"  # folder of views until all are there
+_REMEDY = "choose another folder, or remove this one"
 _ROUNDS = 20  # of draws in place of views from within things
 
 
@@ -135,15 +154,16 @@ def capture_scene(
     """Write posed sRGB images of a driving scene, for fitting a field.
 
     A view from where something stands between the camera and the lane's middle, as
-    within furniture, is drawn anew.
+    within furniture, is drawn again.
 
     Writes `images/0000.png`..., `depth.safetensors` (tensor `depth`, (n, height,
-    width), metres, see `View.depth`) and, last, `transforms.json`.
+    width), metres, see `View.depth`) and, last, `transforms.json`. Until then, each
+    view is kept in the folder `views`: a call that was interrupted goes on from there.
 
     Args:
         scene_path: Mitsuba XML.
         routes_path: routes file of the scene; all its routes are used.
-        out_folder: made if needed.
+        out_folder: made if needed; what it holds must be of the same call.
         n: number of views; see `drive_poses`.
         camera: intrinsics.
         spp: samples per pixel.
@@ -155,21 +175,41 @@ def capture_scene(
         Path of `transforms.json`.
 
     Raises:
-        InputError: the scene has no integrator, or leaves no free place for a view.
+        InputError: the scene has no integrator, no ground at z = 0 under a route, a
+            surface across one, or no free place for a view; or the folder holds views
+            of another call, whose differences are listed.
     """
     require_colour()
     routes = load_routes(routes_path)
+    mount = CameraMount() if mount is None else mount
+    choices = {
+        "camera": to_colmap(camera)[1],
+        "mount": asdict(mount),
+        "views": n,
+        "spp": spp,
+        "seed": seed,
+    }
+    identity = _identity(choices, Path(scene_path), Path(routes_path))
+    root, path = Path(out_folder), Path(out_folder) / FILE_NAMES[0]
+    if path.exists():
+        refuse(path, differences(_made_of(path), identity), _REMEDY)
+        shutil.rmtree(root / _VIEWS, ignore_errors=True)
+        progress(n, n)
+        return path
     scene = load_scene(scene_path)
     if scene.integrator() is None:
         raise InputError(f"{scene_path}: has no integrator; add one, for instance path")
+    _check_ground(scene, Path(scene_path).name, routes, routes_path)
     poses = _free_poses(scene, routes, n, seed, mount)
-    path = begin_posed(out_folder)
-    root = path.parent
+    begin_posed(out_folder)
     names = [f"images/{i:04d}.png" for i in range(n)]
     depth = np.empty((n, camera.height, camera.width), np.float32)
-    for i, view in enumerate(iterate_views(scene, camera, poses, spp, seed)):
-        files.write_image(root / names[i], linear_to_uint8(view.rgb))
-        depth[i] = view.depth
+    renderer, kept = ViewRenderer(scene, camera), files.make_folder(root / _VIEWS)
+    for i, view_seed in enumerate(view_seeds(seed, n)):
+        file = kept / f"{i:04d}.safetensors"
+        unit = Unit(file, {**identity, "view": str(i)}, Record, _REMEDY)
+        image, depth[i] = _view(unit, renderer, poses[i], spp, view_seed)
+        files.write_image(root / names[i], image)
         progress(i + 1, n)
     files.write_safetensors(root / "depth.safetensors", {"depth": depth})
     extra = {
@@ -177,6 +217,59 @@ def capture_scene(
         "depth_file": "depth.safetensors",
         "spp": spp,
         "seed": seed,
+        _IDENTITY: identity,
     }
     write_poses(path, names, camera, poses, extra)
+    shutil.rmtree(kept, ignore_errors=True)
     return path
+
+
+def _check_ground(
+    scene: Any, name: str, routes: Sequence[Route], source: str | Path
+) -> None:
+    """Refuse routes without ground, or with a surface across them."""
+    for route in routes:
+        arc = arc_lengths(0.0, route.length)
+        for findings in (ground_findings, wall_findings):
+            for line in findings(route, arc, scene, name):
+                raise InputError(f"{source}: {line}; no view was rendered")
+
+
+def _view(
+    unit: Unit[Record],
+    renderer: ViewRenderer,
+    pose: np.ndarray,
+    spp: int,
+    view_seed: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return image and depth of a view, which is rendered unless it is kept."""
+    if (done := unit.read()) is not None:
+        return done.tensors["image"], done.tensors["depth"]
+    view = renderer.render(pose, spp, view_seed)
+    tensors = {"image": linear_to_uint8(view.rgb), "depth": view.depth}
+    unit.write(tensors, Record())
+    return tensors["image"], tensors["depth"]
+
+
+def _identity(choices: dict[str, Any], scene: Path, routes: Path) -> dict[str, str]:
+    found = {"format": _FORMAT, **versions(), **flatten("capture", choices)}
+    for name, file in {"scene": scene, "routes": routes, **named_files(scene)}.items():
+        entry = {"file": file.name, "sha256": files.sha256(file)}
+        found[f"file.{name}"] = json.dumps(entry)
+    return found
+
+
+def is_begun(folder: Path) -> bool:
+    """Whether a folder holds what `capture_scene` wrote there."""
+    if (folder / _VIEWS).is_dir():
+        return True
+    try:
+        return bool(_made_of(folder / FILE_NAMES[0]))
+    except InputError:
+        return False
+
+
+def _made_of(path: Path) -> dict[str, str]:
+    found = files.read_json(path)
+    made = found.get(_IDENTITY) if isinstance(found, dict) else None
+    return {**made} if isinstance(made, dict) else {}

@@ -11,8 +11,7 @@ from skimage.measure import block_reduce
 from mi_nerfattack.capture.inputs import find_bounds
 from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera.distortion import distort
-from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.render.camera.projection import project
 
 _COARSE, _FINE = 32, 64  # cells along each edge: while the box shrinks, and at last
 _VIEWS = 48  # at most; fewer cones make the hull larger, never smaller
@@ -120,12 +119,12 @@ def _inside(
         camera = images.camera_of(index)
         pose = images.camera_to_world[index]
         local = (points[alive] - pose[:3, 3]) @ pose[:3, :3]
-        column, row, valid = _project(local, camera)
+        image, valid = project(camera, local)
         seen[alive[valid]] += 1
         pixels = max(camera.fx, camera.fy) / factor * radius / local[valid, 2]
-        at = row[valid] // factor, column[valid] // factor
+        column, row = image[valid].T.astype(int) // factor
         outside = np.zeros(len(alive), bool)
-        outside[valid] = ~_touches(mask, *at, pixels)
+        outside[valid] = ~_touches(mask, row, column, pixels)
         alive = alive[~outside]
     alive = alive[seen[alive] >= _SEEN_BY * len(chosen)]
     inside = np.zeros(len(points), bool)
@@ -150,27 +149,3 @@ def _touches(
         at = level == each
         result[at] = grown[row[at], column[at]]
     return result
-
-
-def _project(
-    local: np.ndarray, camera: Camera
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the pixels of points in the camera's frame, and whether they have one."""
-    front = local[:, 2] > 1e-9
-    z = np.where(front, local[:, 2], 1.0)
-    x, y = local[:, 0] / z, local[:, 1] / z
-    lens = camera.k1, camera.k2, camera.p1, camera.p2
-    if any(lens):
-        # the polynomial folds back far outside of the picture
-        near = np.hypot(x, y) < np.hypot(camera.width, camera.height) / camera.fx
-        front = front & near
-        x, y = distort(np.where(near, x, 0), np.where(near, y, 0), *lens)
-    column = np.floor(camera.fx * x + camera.cx)
-    row = np.floor(camera.fy * y + camera.cy)
-    valid = front & (column >= 0) & (column < camera.width)
-    valid &= (row >= 0) & (row < camera.height)
-    return (
-        np.where(valid, column, 0).astype(int),
-        np.where(valid, row, 0).astype(int),
-        valid,
-    )

@@ -13,37 +13,24 @@ from typing import Any
 import numpy as np
 
 from mi_nerfattack.capture.colmap.model import MODEL_FOLDERS, find_model, read_colmap
+from mi_nerfattack.capture.coverage import points_shown
 from mi_nerfattack.capture.intrinsics import intrinsics_table, read_cameras
 from mi_nerfattack.capture.masks import load_masks
 from mi_nerfattack.capture.posed_images import (
     PosedImages,
     differing,
-    held_out,
     load_images,
-    resize_area,
 )
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.splats import read_points
 from mi_nerfattack.io import files
+from mi_nerfattack.io.positions import require_near
 from mi_nerfattack.render.camera.conventions import opencv_to_opengl, opengl_to_opencv
 from mi_nerfattack.render.camera.intrinsics import Camera
-from mi_nerfattack.render.camera.pose import check_rigid
+from mi_nerfattack.render.camera.pose import nearest_rigid
 
 FILE_NAMES = ("transforms.json", "transforms_train.json")
 """What the JSON file of a folder may be called; the first that is there is read."""
-
-__all__ = [
-    "FILE_NAMES",
-    "PosedImages",
-    "check_rigid",
-    "find_transforms",
-    "held_out",
-    "read_images",
-    "read_pose",
-    "read_table",
-    "read_transforms",
-    "resize_area",
-    "write_poses",
-]
 
 
 def read_images(
@@ -61,7 +48,9 @@ def read_images(
         InputError: nothing of these is there, or it cannot be read.
     """
     folder = Path(path)
-    if folder.is_dir() and not _json_in(folder):
+    with files.reported(path):
+        has_no_json = folder.is_dir() and not _json_in(folder)
+    if has_no_json:
         model = find_model(folder)
         if model is None:
             raise InputError(_nothing_found(folder))
@@ -70,15 +59,16 @@ def read_images(
 
 
 def _nothing_found(folder: Path) -> str:
-    photographs = [
-        item
-        for sub in (folder, folder / "images")
-        for item in (sub.iterdir() if sub.is_dir() else ())
-        if item.suffix.lower() in files.IMAGE_SUFFIXES
-    ]
+    with files.reported(folder):
+        photographs = [
+            item
+            for sub in (folder, folder / "images")
+            for item in (sub.iterdir() if sub.is_dir() else ())
+            if item.suffix.lower() in files.IMAGE_SUFFIXES
+        ]
     advice = (
         f"it holds {len(photographs)} photographs: estimate their poses with "
-        f"'mi-nerfattack capture {photographs[0].parent} -o FOLDER'"
+        f"'mi-nerfattack capture photographs {photographs[0].parent} -o FOLDER'"
         if photographs
         else "give the folder that holds one of them"
     )
@@ -129,14 +119,21 @@ def read_transforms(
             f"{missing[0]!r}; restore the files or leave these frames out "
             "(--skip-missing, or skip_missing=True)"
         )
-    poses = np.stack([read_pose(source, i, frames[i]) for i, _ in found])
-    first = files.read_image(found[0][1])
     used = {i: frames[i] for i, _ in found}
+    poses = read_frames(source, used)
+    first = files.read_image(found[0][1])
     cameras = read_cameras(source, table, used, first.shape)
     paths = [image for _, image in found]
     images, reduced = load_images(paths, cameras, source, long_edge_px)
     masks = load_masks(
-        [_mask_path(source, i, frame) for i, frame in used.items()], cameras, reduced
+        [
+            None
+            if (name := frame.get("mask_path")) is None
+            else named_path(source, f"frames[{i}].mask_path", name)
+            for i, frame in used.items()
+        ],
+        cameras,
+        reduced,
     )
     names = tuple(str(frame["file_path"]) for frame in used.values())
     return PosedImages(
@@ -146,28 +143,74 @@ def read_transforms(
         names,
         tuple(missing),
         differing(reduced),
-        _read_points(source, table),
+        _read_points(source, table, cameras, poses),
         str(table.get("units", "unknown")),
         masks,
     )
 
 
-def _mask_path(source: Path, index: int, frame: Mapping[str, Any]) -> Path | None:
-    name = frame.get("mask_path")
-    if name is None:
-        return None
+def named_path(source: Path, field: str, name: Any) -> Path:
+    """Return the path of a file that a JSON file names, from the folder of this.
+
+    Raises:
+        InputError: with `field`: it is no name.
+    """
     if not isinstance(name, str) or not name:
-        raise InputError(f"{source}: frames[{index}].mask_path: {name!r}; needs a path")
+        raise InputError(f"{source}: {field}: {name!r}; needs a path")
     return source.parent / name.replace("\\", "/")
 
 
-def _read_points(source: Path, table: Mapping[str, Any]) -> np.ndarray | None:
-    name = table.get("points_file")
+def _read_points(
+    source: Path,
+    table: Mapping[str, Any],
+    cameras: Sequence[Camera],
+    poses: np.ndarray,
+) -> np.ndarray | None:
+    """Read our own sparse points or nerfstudio's; None without."""
+    key = "ply_file_path" if table.get("points_file") is None else "points_file"
+    name = table.get(key)
     if name is None:
         return None
-    if not isinstance(name, str) or not name:
-        raise InputError(f"{source}: points_file: {name!r}; needs a path")
-    where = source.parent / name
+    where = named_path(source, key, name)
+    if key == "points_file":
+        points = _own_points(source, where)
+    else:
+        points = _turned_points(source, table, read_points(where), cameras, poses)
+    if not len(points):
+        return None
+    require_near(where, points)
+    return points
+
+
+def _turned_points(
+    source: Path,
+    table: Mapping[str, Any],
+    points: np.ndarray,
+    cameras: Sequence[Camera],
+    poses: np.ndarray,
+) -> np.ndarray:
+    """Bring nerfstudio's points into the frame of the poses.
+
+    Its versions differ in whether they turned the points as they turned the poses, by
+    `applied_transform`. The points are taken of which the images show more, and of a
+    tie those of the file, which today's version has turned.
+    """
+    given = table.get("applied_transform")
+    if given is None:
+        return points
+    try:
+        matrix = np.array(given, np.float64)[:3]
+    except (TypeError, ValueError, IndexError):
+        matrix = np.zeros(0)
+    if matrix.shape != (3, 4) or not np.abs(matrix).max() < np.finfo(np.float32).max:
+        raise InputError(f"{source}: applied_transform: {given!r}; needs 3 x 4 numbers")
+    with np.errstate(all="ignore"):
+        found = [points, points @ matrix[:, :3].T + matrix[:, 3]]
+        counts = [points_shown(cameras, poses, each).sum() for each in found]
+    return found[int(counts[1] > counts[0])]
+
+
+def _own_points(source: Path, where: Path) -> np.ndarray:
     points = files.read_safetensors(where)[0].get("points")
     if points is None or points.ndim != 2 or points.shape[1] != 3:
         shape = None if points is None else points.shape
@@ -190,7 +233,7 @@ def begin_posed(folder: str | Path) -> Path:
         Path of `transforms.json`, to be written last.
     """
     root = files.make_folder(folder)
-    path = root / "transforms.json"
+    path = root / FILE_NAMES[0]
     files.check_writable(path)
     path.unlink(missing_ok=True)
     files.make_folder(root / "images")
@@ -219,7 +262,7 @@ def write_poses(
     """
     cameras = [camera] * len(names) if isinstance(camera, Camera) else list(camera)
     has_one = len(set(cameras)) == 1
-    table: dict[str, Any] = {"camera_model": "OPENCV"}
+    table: dict[str, Any] = {}
     table |= intrinsics_table(cameras[0]) if has_one else {}
     table |= extra or {}
     matrices = opencv_to_opengl(camera_to_world)
@@ -231,12 +274,11 @@ def write_poses(
         }
         for name, own, matrix in zip(names, cameras, matrices, strict=True)
     ]
-    for frame in table["frames"]:
-        if masks is not None and frame["file_path"] in masks:
-            frame["mask_path"] = masks[frame["file_path"]]
-    if times_s is not None:
-        for frame, time_s in zip(table["frames"], times_s, strict=True):
-            frame["time_s"] = time_s
+    for i, frame in enumerate(table["frames"]):
+        if masks is not None and names[i] in masks:
+            frame["mask_path"] = masks[names[i]]
+        if times_s is not None:
+            frame["time_s"] = times_s[i]
     files.write_json(path, table)
 
 
@@ -255,9 +297,10 @@ def read_table(source: Path) -> tuple[dict[str, Any], list[Any]]:
 
 def find_transforms(path: Path) -> Path:
     """Return the JSON file that a path names: itself, or the one in the folder."""
-    if not path.is_dir():
-        return path
-    found = _json_in(path)
+    with files.reported(path):
+        if not path.is_dir():
+            return path
+        found = _json_in(path)
     if found is None:
         raise InputError(f"{path}: has neither {FILE_NAMES[0]} nor {FILE_NAMES[1]}")
     return found
@@ -265,9 +308,7 @@ def find_transforms(path: Path) -> Path:
 
 def _find_image(source: Path, index: int, frame: Any) -> Path | None:
     name = frame.get("file_path") if isinstance(frame, dict) else None
-    if not isinstance(name, str) or not name:
-        raise InputError(f"{source}: frames[{index}].file_path: {name!r}; needs a path")
-    base = str(source.parent / name.replace("\\", "/"))
+    base = str(named_path(source, f"frames[{index}].file_path", name))
     for suffix in ("", *files.IMAGE_SUFFIXES):
         candidate = Path(base + suffix)
         if os.path.isfile(candidate):
@@ -275,20 +316,30 @@ def _find_image(source: Path, index: int, frame: Any) -> Path | None:
     return None
 
 
-def read_pose(source: Path, index: int, frame: Mapping[str, Any]) -> np.ndarray:
-    """Read the pose of one frame.
+def read_frames(source: Path, frames: Mapping[int, Any]) -> np.ndarray:
+    """Read the poses of frames.
 
     Args:
         source: the JSON file, for messages.
-        index: of the frame, for messages.
-        frame: with `transform_matrix`, OpenGL axes, (4, 4) or (3, 4).
+        frames: by their index in the file, each with `transform_matrix`, OpenGL axes,
+            (4, 4) or (3, 4). A rotation that is rounded to three decimals is replaced
+            by the nearest one.
 
     Returns:
-        camera_to_world: (4, 4), OpenCV axes, float64.
+        camera_to_world: (n, 4, 4), OpenCV axes, float64.
 
     Raises:
-        InputError: the matrix is missing or not a rigid pose.
+        InputError: a matrix is missing or not a rigid pose, or the poses are far from
+            the origin.
     """
+    poses = np.stack([_read_pose(source, i, frame) for i, frame in frames.items()])
+    require_near(source, poses[:, :3, 3])
+    return opengl_to_opencv(poses)
+
+
+def _read_pose(source: Path, index: int, frame: Any) -> np.ndarray:
+    if not isinstance(frame, dict):
+        raise InputError(f"{source}: frames[{index}]: {frame!r}; needs an object")
     where = f"{source}: frames[{index}].transform_matrix"
     try:
         matrix = np.array(frame.get("transform_matrix"), dtype=np.float64)
@@ -298,5 +349,4 @@ def read_pose(source: Path, index: int, frame: Mapping[str, Any]) -> np.ndarray:
         matrix = np.vstack([matrix, [0, 0, 0, 1]])
     if matrix.shape != (4, 4):
         raise InputError(f"{where}: shape {matrix.shape}; needs 4 x 4 numbers")
-    check_rigid(matrix, where)
-    return opengl_to_opencv(matrix)
+    return nearest_rigid(matrix, where)

@@ -1,9 +1,10 @@
 """The sub-commands of ``mi-nerfattack``, one file each.
 
 A command is a frozen dataclass: its fields are the arguments, their docstrings the
-help, and ``run()`` does the work and returns the exit code or, where it prints
-figures, these, as a ``Result``; then it takes ``json``. These modules are all
-imported for ``--help``; import anything slow (torch, our own parts) inside run().
+help (`cli` has what ``output``, ``json`` and ``run_folder`` share), and ``run()`` does
+the work and returns the exit code or, where it prints figures, these, as a ``Result``;
+then it takes ``json``. These modules are all imported for ``--help``; import anything
+slow (torch, our own parts) inside run().
 """
 
 from __future__ import annotations
@@ -12,31 +13,43 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
-from mi_nerfattack.commands.asset import Asset
+from mi_nerfattack.commands.asset import AssetCube, AssetFolder, AssetMesh
 from mi_nerfattack.commands.attack import Attack
 from mi_nerfattack.commands.bake import Bake
 from mi_nerfattack.commands.calibrate import Calibrate
-from mi_nerfattack.commands.capture import Capture
+from mi_nerfattack.commands.capture import (
+    CapturePhotographs,
+    CaptureScene,
+    CaptureVideo,
+)
 from mi_nerfattack.commands.check import Check
 from mi_nerfattack.commands.compare_drives import CompareDrives
+from mi_nerfattack.commands.compare_field import CompareField
 from mi_nerfattack.commands.demo import Demo
 from mi_nerfattack.commands.doctor import Doctor
 from mi_nerfattack.commands.drive import DriveCommand
 from mi_nerfattack.commands.evaluate import Evaluate
-from mi_nerfattack.commands.export import Export
+from mi_nerfattack.commands.export import (
+    ExportFaces,
+    ExportMesh,
+    ExportOpenscenario,
+    ExportPrint,
+    ExportRoutes,
+    ExportScreen,
+)
 from mi_nerfattack.commands.fit import Fit
 from mi_nerfattack.commands.monitor import Monitor
 from mi_nerfattack.commands.overlay import OverlayCommand
-from mi_nerfattack.commands.refine import Refine
 from mi_nerfattack.commands.render import RenderFrame, RenderPath
 from mi_nerfattack.commands.report import Report
 from mi_nerfattack.commands.reproduce import Reproduce
 from mi_nerfattack.commands.retrain import Retrain
 from mi_nerfattack.commands.serve_policy import ServePolicy
-from mi_nerfattack.commands.shared.result import Result
+from mi_nerfattack.commands.shared.terminal import Result
 from mi_nerfattack.commands.sweep import Sweep
 from mi_nerfattack.commands.train import Train
 from mi_nerfattack.commands.transfer import Transfer
+from mi_nerfattack.commands.upgrade import Upgrade
 from mi_nerfattack.commands.view import View
 
 
@@ -79,14 +92,37 @@ _CAR = Group(
     },
 )
 _RENDER = Group(
-    "Render a Mitsuba scene: one frame, or a camera path.",
-    {"frame": RenderFrame, "path": RenderPath},
+    "Render a frame or a path of a Mitsuba scene; compare it to a field.",
+    {"frame": RenderFrame, "path": RenderPath, "compare": CompareField},
+)
+_CAPTURE = Group(
+    "Make posed images of a scene, of photographs or of a video.",
+    {
+        "scene": CaptureScene,
+        "photographs": CapturePhotographs,
+        "video": CaptureVideo,
+    },
+)
+_ASSET = Group(
+    "Fit a field to an object, whose texture can then be attacked.",
+    {"mesh": AssetMesh, "cube": AssetCube, "folder": AssetFolder},
+)
+_EXPORT = Group(
+    "Write objects, routes and scenarios for other programs, paper and screens.",
+    {
+        "mesh": ExportMesh,
+        "faces": ExportFaces,
+        "openscenario": ExportOpenscenario,
+        "print": ExportPrint,
+        "routes": ExportRoutes,
+        "screen": ExportScreen,
+    },
 )
 #: What can be called, by theme.
 THEMES: dict[str, Commands] = {
     "start": {"doctor": Doctor, "demo": Demo},
-    "place": {"capture": Capture, "fit": Fit, "bake": Bake, "render": _RENDER},
-    "object": {"asset": Asset, "export": Export},
+    "place": {"capture": _CAPTURE, "fit": Fit, "bake": Bake, "render": _RENDER},
+    "object": {"asset": _ASSET, "export": _EXPORT},
     "policy": {"train": Train, "evaluate": Evaluate, "retrain": Retrain},
     "attack": {
         "check": Check,
@@ -94,7 +130,7 @@ THEMES: dict[str, Commands] = {
         "sweep": Sweep,
         "transfer": Transfer,
         "reproduce": Reproduce,
-        "refine": Refine,
+        "upgrade": Upgrade,
     },
     "look": {"report": Report, "view": View},
     "car": {"car": _CAR},

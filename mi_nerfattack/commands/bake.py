@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import tyro
 
-from mi_nerfattack.commands.shared.result import Result
+from mi_nerfattack.commands.shared.options import Settings
+from mi_nerfattack.commands.shared.terminal import Result
 
 if TYPE_CHECKING:
     from mi_nerfattack.scenario.scenario import Scenario
@@ -27,8 +28,10 @@ class Bake:
 
     scenario: tyro.conf.Positional[Path]
     """Scenario file (.toml)."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    output: Path | None = None
     """Field file to write (.safetensors); the scenario's scene.bricks by default."""
+    settings: Settings = ()
+    """Set a key of the scenario: scene.field=mine.safetensors."""
     cone: float = 1 / 64
     """Edge of a brick's parts over the distance to the nearest route; half takes up to
     six times the memory."""
@@ -55,13 +58,12 @@ class Bake:
             bake_verdict,
             write_bake_report,
         )
-        from mi_nerfattack.report.pages.fit import finite
         from mi_nerfattack.scenario.scenario import load_scenario
         from mi_nerfattack.scenario.world import load_posed
         from mi_nerfattack.vehicle.route.route import load_routes
 
         options = BakeOptions(self.cone, self.passes, self.views, self.seed)
-        scenario, _ = load_scenario(self.scenario)
+        scenario, _ = load_scenario(self.scenario, settings=self.settings)
         file, output = self._files(scenario)
         camera, mount = scenario.camera.build()
         routes = load_routes(scenario.scene.routes.file)
@@ -91,7 +93,7 @@ class Bake:
         title = f"Bake of {file.name}"
         page = write_bake_report(report_folder(output), views, facts, title)
         told = f"{bake_verdict(views)}\nWrote {output} and {page}."
-        return Result(finite(facts | bake_summary(views)), lambda: print(told))
+        return Result(facts | bake_summary(views), lambda: print(told))
 
     def _files(self, scenario: Scenario) -> tuple[Path, Path]:
         """Return field and output; refuse what would fail after the bake."""

@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
-from mi_nerfattack.commands.shared.result import Result
-from mi_nerfattack.commands.shared.terminal import ask, confirm, say
+from mi_nerfattack.commands.shared.terminal import Result, ask, confirm, say
 
 if TYPE_CHECKING:
-    from mi_nerfattack.robot.devices import AbstractEnable
-    from mi_nerfattack.robot.vesc.calibration import Calibration
-    from mi_nerfattack.robot.vesc.guided import Arc, Drive
-    from mi_nerfattack.robot.vesc.motor import VescMotor
+    from mi_nerfattack.car.devices import AbstractEnable
+    from mi_nerfattack.car.vesc.calibration import Calibration
+    from mi_nerfattack.car.vesc.guided import Arc, Drive
+    from mi_nerfattack.car.vesc.motor import VescMotor
 
 _FASTEST_MS, _FARTHEST_M = 1.5, 5.0
 
@@ -37,7 +36,7 @@ class Calibrate:
 
     port: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PORT")]
     """Serial port of the VESC, such as /dev/ttyACM0."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    output: Path
     """File for the calibration (.toml); one that exists is not written over."""
     calibration: Path | None = None
     """File to begin with; by default the scales of a RACECAR/J."""
@@ -63,14 +62,14 @@ class Calibrate:
 
     def run(self) -> Result:
         """Ask, arm, drive, ask, fit and write."""
-        from mi_nerfattack.deploy.car import SMALL_CAR
-        from mi_nerfattack.errors import InputError
-        from mi_nerfattack.robot.vesc.calibration import (
+        from mi_nerfattack.car.vesc.calibration import (
             Calibration,
             read_calibration,
             write_calibration,
         )
-        from mi_nerfattack.robot.vesc.guided import DRIVES, fit_arcs, read_arcs
+        from mi_nerfattack.car.vesc.guided import DRIVES, fit_arcs, read_arcs
+        from mi_nerfattack.deploy.car import SMALL_CAR
+        from mi_nerfattack.errors import InputError
 
         before = Calibration()
         if self.calibration is not None:
@@ -112,13 +111,13 @@ class Calibrate:
 
     def _drive(self, before: Calibration, arcs: dict[Drive, Arc], kept: Path) -> None:
         """Arm, and add the drives that are missing; each is kept at once."""
-        from mi_nerfattack.robot.drive.safety.enable import (
+        from mi_nerfattack.car.drive.safety.enable import (
             JoystickEnable,
             check_held,
             wait_for_press,
         )
-        from mi_nerfattack.robot.vesc.guided import DRIVES, write_arcs
-        from mi_nerfattack.robot.vesc.motor import VescMotor
+        from mi_nerfattack.car.vesc.guided import DRIVES, write_arcs
+        from mi_nerfattack.car.vesc.motor import VescMotor
 
         pad = JoystickEnable(self.enable, self.button, time.monotonic, self.silence_s)
         with (
@@ -143,10 +142,9 @@ class Calibrate:
         from mi_nerfattack.errors import InputError
         from mi_nerfattack.io import files
 
-        slowest = before.erpm_least / before.erpm_per_ms
         bounds = {
             "wheelbase_m": (0.0, 5.0),
-            "speed_ms": (slowest, _FASTEST_MS),
+            "speed_ms": (before.slowest_ms, min(_FASTEST_MS, before.fastest_ms)),
             "distance_m": (0.1, _FARTHEST_M),
             "steering_rad": (0.0, before.steering_most_rad),
         }
@@ -165,20 +163,22 @@ class Calibrate:
         self, motor: VescMotor, pad: AbstractEnable, name: str, steering_rad: float
     ) -> Arc:
         """Drive until a drive was not broken off, and ask how far it came."""
-        from mi_nerfattack.robot.devices import Command
-        from mi_nerfattack.robot.drive.safety.enable import (
+        from mi_nerfattack.car.devices import Command
+        from mi_nerfattack.car.drive.safety.enable import (
             ReleasedError,
             check_held,
             wait_for_press,
         )
-        from mi_nerfattack.robot.vesc.guided import drive_arc
+        from mi_nerfattack.car.vesc.guided import drive_arc, room_m
 
+        room = room_m(self.distance_m, self.speed_ms)
         command = Command(self.speed_ms, steering_rad)
         while True:
             ask(
                 f"Drive {name}, about {self.distance_m:g} m at {self.speed_ms:g} m/s. "
-                "Put the car on the floor with twice that free; mark where the middle "
-                "of its rear axle stands, and the line straight ahead. Enter"
+                f"Put the car on the floor with {room:.1f} m free, and more if its "
+                "scale of speed may be wrong; mark where the middle of its rear axle "
+                "stands, and the line straight ahead. Enter"
             )
             wait_for_press(pad, time.sleep, say)
             try:
@@ -193,8 +193,8 @@ class Calibrate:
 
 def _ask_for_arc(servo: float, steps: int) -> Arc:
     """Ask where a drive ended, until the answer is confirmed and tells anything."""
+    from mi_nerfattack.car.vesc.guided import Arc
     from mi_nerfattack.errors import InputError
-    from mi_nerfattack.robot.vesc.guided import Arc
 
     while True:
         forward_m = _ask_number("How far along that line did the middle come, metres")

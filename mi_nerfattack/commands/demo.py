@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import tyro
 
-from mi_nerfattack.commands.asset import Asset
-from mi_nerfattack.commands.shared.result import Result
+from mi_nerfattack.commands.asset import AssetMesh
+from mi_nerfattack.commands.shared.options import Settings
+from mi_nerfattack.commands.shared.terminal import Result
 
 
 @dataclass(frozen=True)
@@ -20,11 +21,13 @@ class Demo:
     Takes about ten minutes on two slow cores, and opens nothing but files.
     """
 
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    object: tyro.conf.Positional[Path | None] = None
+    """Attack this object instead of the bundled hydrant: a mesh (glTF, OBJ, PLY), which
+    is fitted first, or a grid field file made by asset."""
+    output: Path | None = None
     """Run folder, new or of an interrupted demo; runs/demo-DATE-TIME by default."""
-    object: Path | None = None
-    """Attack this object in place of the bundled hydrant: a mesh (glTF, OBJ, PLY),
-    which is fitted first, or a grid field file made by asset."""
+    settings: Settings = ()
+    """Set a key of the bundled scenario: seed=1."""
     height_m: float = 0.75
     """Height of a mesh, metres; the scene shows it 3.3 times as tall."""
     resolution: Literal[64, 128] = 64
@@ -41,7 +44,7 @@ class Demo:
 
     def run(self) -> Result:
         """Run the bundled scenario."""
-        from mi_nerfattack.commands.shared.run_scenario import run_scenario
+        from mi_nerfattack.commands.attack import run_scenario
         from mi_nerfattack.scenes import bundled
 
         stamp = time.strftime("%Y%m%d-%H%M%S")
@@ -51,6 +54,7 @@ class Demo:
             output,
             lambda: self._object_field(output),
             anyway=self.anyway,
+            settings=self.settings,
         )
 
     def _object_field(self, output: Path) -> Path | None:
@@ -58,9 +62,9 @@ class Demo:
         if self.object is None or self.object.suffix == ".safetensors":
             return self.object
         field = output.parent / f"{output.name}-object.safetensors"
-        Asset(
-            str(self.object),
-            field,
+        AssetMesh(
+            source=self.object,
+            output=field,
             height_m=self.height_m,
             resolution=self.resolution,
         ).run().show()

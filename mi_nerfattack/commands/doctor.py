@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mi_nerfattack.commands.shared.result import Result
+from mi_nerfattack.commands.shared.terminal import Result
 
 
 @dataclass(frozen=True)

@@ -13,25 +13,25 @@ import tyro
 
 from mi_nerfattack.commands.shared.evaluate_options import (
     PlaceOptions,
-    PolicyOptions,
     parse_conditions,
     parse_scales,
 )
+from mi_nerfattack.commands.shared.options import Settings, command_line
 from mi_nerfattack.commands.shared.policy_file import PolicyFile
-from mi_nerfattack.commands.shared.result import Result
-from mi_nerfattack.commands.shared.terminal import console
-from mi_nerfattack.commands.shared.words import command_line
+from mi_nerfattack.commands.shared.terminal import Result, console
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
     from mi_nerfattack.deploy.place import Place
     from mi_nerfattack.evaluation.evaluate import EvaluateSettings
     from mi_nerfattack.evaluation.identity import EnvironmentUnder
-    from mi_nerfattack.evaluation.work import EvaluateWork, Evaluation
+    from mi_nerfattack.evaluation.work import EvaluateDrives, Evaluation
     from mi_nerfattack.scenario.policy import AbstractPolicySection
     from mi_nerfattack.system.workers import AbstractWorkers
     from mi_nerfattack.training.record import TrainingRecord
     from mi_nerfattack.vehicle.route.route import Route
+
+_PERIOD_S = 0.1  # of a server while its map is read
 
 
 @dataclass(frozen=True)
@@ -47,52 +47,42 @@ class Evaluate:
     continues: ClassVar[bool] = True
 
     policy: tyro.conf.Positional[str | None] = None
-    """Policy: .safetensors of train, .pt2, .pt, .onnx, FILE.py:NAME, a URL, or a TOML
-    file: a scenario, which is driven in its own scene unless options name another, or
-    the sections [policy] and, where these are its own, [camera] and [vehicle] of one;
-    the bundled policy by default."""
+    """Policy: .safetensors of train, .pt2, .pt, .onnx, FILE.py:NAME, a URL; or a TOML
+    file, a scenario or its sections [policy], [camera] and [vehicle]. A scenario is
+    driven in its scene unless options name another. The bundled policy by default."""
+    settings: Settings = ()
+    """Set a key of the TOML file: policy.trust_code=true."""
     environments: tuple[str, ...] = ("surrogate", "mitsuba", "mujoco")
-    """Environments: surrogate, mitsuba, mujoco, mujoco_gl, carla (needs --server and
-    --routes-file)."""
+    """Of surrogate, mitsuba, mujoco, mujoco_gl, and carla (needs --server)."""
     routes: tuple[str, ...] = ()
     """Routes by name; all by default."""
     runs: int = 20
-    """Drives of each environment, route and case."""
+    """Drives of each case, environment and route."""
     objects: tuple[int, ...] = (1,)
-    """Numbers of objects beside the road at a time, a case each: 1 6; every route is
-    driven without, too, and by 0 without alone."""
+    """Numbers of objects beside the road, a case each; 0: without objects alone."""
     scale: tuple[float, ...] = ()
-    """Least and most factor to the natural size: of all objects, or of each --object in
-    turn, as in 1 1 0.8 1.3; the natural size by default."""
+    """Least and most factor to the natural size, of all objects or of each --object."""
     seed: int = 1
-    """Of starts, places, textures and images; training chooses its best epoch by the
-    drives of seed 0."""
+    """Seed of starts, textures and images."""
     horizon: int = 1000
-    """Most control periods of a drive; it ends 2 m before its route does."""
+    """Most control periods of a drive."""
     conditions: tuple[str, ...] = ("day",)
-    """Times of day (day, morning, noon, evening, overcast), each with an exposure in
-    powers of two on request: noon, noon:+1, evening:-0.5. Not for the surrogate."""
+    """Times of day and exposures, not for the surrogate: noon, evening,exposure:+1."""
     spp: int = 4
     """Samples per pixel of path-traced images."""
     where: Annotated[
         PlaceOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="place")
     ] = PlaceOptions()
-    """Where."""
-    options: Annotated[
-        PolicyOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="policy")
-    ] = PolicyOptions()
-    """How the policy is called."""
     workers: int | None = None
-    """Processes that drive; one a core by default, for a URL 1: its server may keep a
-    state. 1 drives in this process, as carla always does."""
+    """Processes that drive; by default one per core."""
     drives: Path = Path("runs/evaluate")
-    """Folder of finished drives; those of other evaluations can be in it, too."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Folder of finished drives."""
+    output: Path | None = None
     """File for the card (.json)."""
     page: Path | None = None
-    """Folder for the policy's page: NAME.md, NAME.card.json and NAME.png."""
+    """Folder for the policy's page: NAME.md, .card.json, .png."""
     json: bool = False
-    """Print the card as JSON, and nothing else."""
+    """Print the card as JSON instead of the table."""
 
     def run(self) -> Result:
         """Drive, summarise, print and write."""
@@ -112,7 +102,7 @@ class Evaluate:
         record = None if self.page is None else _training_record(work)
         start = time.monotonic()
         with StageBars() as bars:
-            bars.say(f"drives are kept in {work.folder}")
+            bars.say(f"drives are kept in {work.store.folder}")
             if any(self.objects) and not work.place.objects:
                 town = "a town its --scene, " * (self.where.server is not None)
                 bars.say(f"no drives past objects: {town}a scene its --object FILE")
@@ -126,7 +116,7 @@ class Evaluate:
     def _write_page(
         self,
         folder: Path,
-        work: EvaluateWork,
+        work: EvaluateDrives,
         record: TrainingRecord | None,
         found: Evaluation,
         wall_s: float,
@@ -145,15 +135,15 @@ class Evaluate:
         path = write_policy_page(folder, about, record, found.card, found.drives)
         print(f"{path}: written", file=sys.stderr)
 
-    def _work(self) -> EvaluateWork:
+    def _work(self) -> EvaluateDrives:
         """Check everything that can be checked before the first drive."""
-        from mi_nerfattack.evaluation.identity import identify
-        from mi_nerfattack.evaluation.work import EvaluateWork, check_policy
+        from mi_nerfattack.drives.store import Store
+        from mi_nerfattack.evaluation.work import EvaluateDrives, check_policy
         from mi_nerfattack.scenario.world import at_own_speed
 
-        section = self.options.section(self.policy)
-        under = self._environments()
-        file, is_chosen = PolicyFile.read(self.policy), self.where != PlaceOptions()
+        file = PolicyFile.read(self.policy, self.settings)
+        is_chosen = self.where != PlaceOptions()
+        section, under = file.section, self._environments()
         place = file.place(self.where.build(), is_chosen)
         self._check_wheels(file)
         own = file.scenario is not None and not is_chosen
@@ -163,9 +153,8 @@ class Evaluate:
             routes = tuple(at_own_speed(route, motion) for route in routes)
             settings = replace(settings, car_width_m=place.car.width)
         check_policy(section.build(), place, routes)
-        chosen = section, place, under, routes, settings
-        identities = identify(*chosen, file.vehicle)
-        return EvaluateWork(*chosen, self.drives, identities, file.vehicle)
+        store, vehicle = Store(self.drives), file.vehicle
+        return EvaluateDrives(store, section, place, under, routes, settings, vehicle)
 
     def _settings(self, place: Place, is_own: bool) -> EvaluateSettings:
         """Say how to drive at a place: the scenario's own, or one of the options."""
@@ -194,7 +183,30 @@ class Evaluate:
             _check_different("--routes", names)
         elif file.scenario is not None and self.where == PlaceOptions():
             names = (file.scenario.scene.route,)
+        if path.suffix == ".xml":
+            return self._leaderboard(path)
         return tuple(load_routes(path, names))
+
+    def _leaderboard(self, path: Path) -> tuple[Route, ...]:
+        """Follow the lanes of the server's town."""
+        from mi_nerfattack.deploy.carla.route import town_routes
+        from mi_nerfattack.deploy.carla.session import (
+            CarlaServer,
+            CarlaSession,
+            load_client,
+        )
+
+        if self.where.server is None:
+            raise InputError(
+                f"--routes-file: {path}; routes of CARLA's leaderboard need the town: "
+                "--server, or convert the file with 'mi-nerfattack export routes'"
+            )
+        api = load_client()
+        session = CarlaSession(CarlaServer.parse(self.where.server), _PERIOD_S, api)
+        try:
+            return tuple(town_routes(path, session.town_map, api, self.routes))
+        finally:
+            session.close()
 
     def _check_wheels(self, file: PolicyFile) -> None:
         from mi_nerfattack.scenario.vehicle import CustomSection
@@ -289,7 +301,7 @@ def _check_different(option: str, names: tuple[str, ...]) -> None:
         raise InputError(f"{option}: {' '.join(names)!r}; at least one, each once")
 
 
-def _training_record(work: EvaluateWork) -> TrainingRecord | None:
+def _training_record(work: EvaluateDrives) -> TrainingRecord | None:
     """Read what training wrote beside the policy; None where it wrote nothing."""
     from mi_nerfattack.scenario.policy import PilotNetSection, ProgramSection
     from mi_nerfattack.training.record import read_record

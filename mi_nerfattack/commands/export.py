@@ -1,122 +1,98 @@
-"""``mi-nerfattack export``: an object as a mesh, as pictures, on paper."""
+"""``mi-nerfattack export``: objects, routes and scenarios for other programs."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Literal
 
 import tyro
 
-from mi_nerfattack.commands.shared.box_options import BoxOptions
-from mi_nerfattack.commands.shared.result import Result
-
-if TYPE_CHECKING:
-    from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.commands.monitor import ScreenOptions
+from mi_nerfattack.commands.shared.options import check_suffix
+from mi_nerfattack.commands.shared.terminal import Result
+from mi_nerfattack.errors import InputError
 
 
 @dataclass(frozen=True)
-class Export:
-    """Write an object's field as a coloured mesh (glTF) or as six pictures (PNG).
+class ExportMesh:
+    """Write an object's field as a coloured mesh (glTF).
 
-    A run folder of attack holds its attacked objects as fields, objects/ID.safetensors.
     Colours are radiance: reflectance times the light that the object was captured in.
-    The attacked cube of a run folder is also put on paper (--print, to cut, fold and
-    glue) and on a monitor (--monitor), at its physical size.
+    With --mesh, give the size and axes that were given to asset.
     """
 
     field: tyro.conf.Positional[Path]
-    """Field of an object (.safetensors), as asset and attack write them; with --print
-    and --monitor a run folder of attack."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """FILE.glb for a mesh; a folder for px.png, nx.png ... nz.png and faces.json."""
+    """Field of an object (.safetensors), of asset or in a run folder's objects."""
+    output: Path
+    """File to write (.glb)."""
     mesh: Path | None = None
-    """Colour the triangles of this mesh, which the field was fitted to, in place of
-    the surface of the field; give the size and axes that were given to asset."""
+    """Colour the triangles of this mesh, which the field was fitted to, instead of the
+    surface of the field."""
     height_m: float | None = None
-    """Of --mesh: scale to this height, metres."""
+    """Scale the mesh to this height, metres."""
     longest_m: float | None = None
-    """Of --mesh: scale the longest edge of the bounding box to this, metres."""
+    """Scale the longest edge of its bounding box to this, metres."""
     up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
-    """Of --mesh: axis that points up."""
+    """Axis of the mesh that points up."""
     turn_deg: float = 0.0
-    """Of --mesh: turn about the vertical."""
-    pixels_per_m: float | None = None
-    """Of the pictures; 256 pixels along the longest edge by default."""
+    """Turn the mesh about the vertical."""
     json: bool = False
-    """End with one line of JSON in place of the sentences."""
-    box: Annotated[BoxOptions, tyro.conf.arg(name="")] = BoxOptions()
 
     def run(self) -> Result:
-        """Read, sample the surface or look at the sides, and write."""
+        """Read, sample the surface and write."""
         from mi_nerfattack import variant
-        from mi_nerfattack.errors import InputError
-        from mi_nerfattack.fields.io import load_grid
-        from mi_nerfattack.io import files
-
-        if self.box.is_asked:
-            return self._write_box()
-        if self.output is None:
-            raise InputError("give -o, or, for a run folder, --print or --monitor")
-        if self.box != BoxOptions():
-            raise InputError(
-                "--object, --size-mm and the options after them: are for --print and "
-                "--monitor"
-            )
-        output, suffix = self.output, self.output.suffix.lower()
-        if suffix not in (".glb", ""):
-            raise InputError(f"{output}: give FILE.glb or a folder's name")
-        self._refuse_unused(output)
-        variant.ensure()
-        grid = load_grid(self.field)
-        if suffix == "":
-            return self._write_faces(grid, output)
-        files.check_writable(output)
-        return self._write_mesh(grid, output)
-
-    def _write_box(self) -> Result:
-        from mi_nerfattack import variant
-        from mi_nerfattack.commands.shared.progress import StageBars
-        from mi_nerfattack.errors import InputError
-
-        if self.output is not None:
-            raise InputError(
-                f"-o {self.output}: --print and --monitor name their own files; give "
-                "-o by itself, with the field of an object"
-            )
-        options = {"mesh": self.mesh, "pixels-per-m": self.pixels_per_m}
-        for name, value in (options | self._mesh_options()).items():
-            if value is not None:
-                raise InputError(f"--{name}: is for -o, not for --print and --monitor")
-        variant.ensure()
-        with StageBars() as bars:
-            found = self.box.write(self.field, bars.counter("printing", "page "))
-        document = {kind: figures for kind, (figures, _) in found.items()}
-        told = [sentence for _, sentence in found.values()]
-        return Result(document, lambda: print(*told, sep="\n"))
-
-    def _write_mesh(self, grid: GridField, output: Path) -> Result:
         from mi_nerfattack.capture.mesh.gltf_writer import write_glb
         from mi_nerfattack.capture.mesh.surface import field_surface, painted_mesh
         from mi_nerfattack.capture.object_views import Placement
+        from mi_nerfattack.fields.io import load_grid
+        from mi_nerfattack.io import files
 
+        output = self.output
+        check_suffix(output, ".glb")
+        files.check_writable(output)
+        placement = Placement(self.height_m, self.longest_m, self.up, self.turn_deg)
+        if self.mesh is None and placement != Placement():
+            raise InputError(
+                "--height-m, --longest-m, --up, --turn-deg: place a mesh; give --mesh"
+            )
+        variant.ensure()
+        grid = load_grid(self.field)
         if self.mesh is None:
             mesh = field_surface(grid)
         else:
-            placement = Placement(self.height_m, self.longest_m, self.up, self.turn_deg)
             mesh = painted_mesh(grid, placement.mesh(self.mesh))
         write_glb(output, mesh)
         counts = {"triangles": len(mesh.faces), "vertices": len(mesh.vertices)}
         told = "Wrote {}: {} triangles, {} vertices".format(output, *counts.values())
         return Result({"output": str(output), **counts}, lambda: print(told))
 
-    def _write_faces(self, grid: GridField, output: Path) -> Result:
-        from mi_nerfattack.capture.mesh.cube_faces import render_faces, write_faces
-        from mi_nerfattack.errors import InputError
 
-        if output.is_file():
-            raise InputError(f"{output}: is a file; give a folder's name")
-        faces = render_faces(grid, self.pixels_per_m)
+@dataclass(frozen=True)
+class ExportFaces:
+    """Write six pictures of an object's field, as of the faces of a box."""
+
+    field: tyro.conf.Positional[Path]
+    """Field of an object (.safetensors), of asset or in a run folder's objects."""
+    output: Path
+    """Folder for px.png, nx.png ... nz.png and faces.json."""
+    pixels_per_m: float | None = None
+    """Pixels per metre; 256 along the longest edge by default."""
+    json: bool = False
+
+    def run(self) -> Result:
+        """Read, look at the sides and write."""
+        from mi_nerfattack import variant
+        from mi_nerfattack.capture.mesh.cube_faces import render_faces, write_faces
+        from mi_nerfattack.fields.io import load_grid
+        from mi_nerfattack.io import files
+
+        output = self.output
+        if output.suffix or output.is_file():
+            raise InputError(f"{output}: give a folder's name")
+        files.check_folder(output)
+        variant.ensure()
+        faces = render_faces(load_grid(self.field), self.pixels_per_m)
         write_faces(output, faces)
         size_m = (faces.upper - faces.lower).tolist()
         edges = " x ".join(f"{edge:.3f}" for edge in size_m)
@@ -127,23 +103,163 @@ class Export:
         figures = {"size_m": size_m, "pixels_per_m": float(faces.pixels_per_m)}
         return Result({"output": str(output), **figures}, lambda: print(told))
 
-    def _refuse_unused(self, output: Path) -> None:
-        """Raise InputError for an option that the kind of output has no use for."""
-        from mi_nerfattack.errors import InputError
 
-        if not output.suffix and self.mesh is not None:
-            raise InputError(f"--mesh: is for FILE.glb, not for {output}")
-        if output.suffix and self.pixels_per_m is not None:
-            raise InputError(f"--pixels-per-m: is for pictures, not for {output}")
-        for name, value in self._mesh_options().items():
-            if value is not None and self.mesh is None:
-                raise InputError(f"--{name}: needs --mesh")
+@dataclass(frozen=True)
+class ExportPrint:
+    """Write the attacked box of a run as a net on paper, to cut, fold and glue."""
 
-    def _mesh_options(self) -> dict[str, object]:
-        """Return the options that only --mesh has a use for, None if not given."""
-        return {
-            "height-m": self.height_m,
-            "longest-m": self.longest_m,
-            "up": self.up,
-            "turn-deg": self.turn_deg or None,
+    run_folder: tyro.conf.Positional[Path]
+    output: Path
+    """File to write (.pdf)."""
+    box: str | None = None
+    """Id of the box; the only one by default."""
+    size_mm: float | None = None
+    """Longest edge; as large as in the run by default."""
+    paper: Literal["a4", "a3", "letter"] = "a4"
+    """Paper; a net that is larger gets several pages."""
+    dpi: int = 300
+    """Pixels per inch."""
+    json: bool = False
+
+    def run(self) -> Result:
+        """Read the box and write its net."""
+        from mi_nerfattack import variant
+        from mi_nerfattack.commands.shared.progress import StageBars
+        from mi_nerfattack.io import files
+        from mi_nerfattack.props.attacked import read_box
+        from mi_nerfattack.props.paper import write_net
+
+        path = self.output
+        check_suffix(path, ".pdf")
+        files.check_writable(path)
+        variant.ensure()
+        with StageBars() as bars:
+            box, _ = read_box(self.run_folder, self.box)
+            edges, counter = (
+                box.edges_mm(self.size_mm),
+                bars.counter("printing", "page "),
+            )
+            count = write_net(path, box, edges, self.paper, self.dpi, counter)
+        size = " x ".join(f"{edge:.1f}" for edge in edges)
+        pages = "page" if count == 1 else "pages"
+        told = f"Wrote {path}: net of {box.name}, {size} mm, {count} {pages}"
+        figures = {"edges_mm": edges.tolist(), "pages": count}
+        document = {"output": str(path), "box": box.name, **figures}
+        return Result(document, lambda: print(told))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportScreen(ScreenOptions):
+    """Write a face of the attacked box of a run for a monitor, at its physical size."""
+
+    output: Path
+    """File to write (.png or .html)."""
+    size_mm: float | None = None
+    """Longest edge; as large as in the run by default."""
+    json: bool = False
+
+    def run(self) -> Result:
+        """Read the box and write the picture."""
+        from mi_nerfattack import variant
+        from mi_nerfattack.io import files
+        from mi_nerfattack.props.attacked import read_box, seen_most
+        from mi_nerfattack.props.monitor import screen_image, screen_page
+        from mi_nerfattack.props.net import MM, Net
+
+        path, screen = self.output, self._make_screen()
+        check_suffix(path, ".png", ".html")
+        files.check_writable(path)
+        variant.ensure()
+        box, views = read_box(self.run_folder, self.box)
+        face = self.face or seen_most(box, views)
+        edges = box.edges_mm(self.size_mm)
+        spot = Net(edges).faces[face]
+        size, longest = (spot.width, spot.height), float(edges.max())
+        image = screen_image(screen, box.images[face], size, self.background, longest)
+        if path.suffix.lower() == ".png":
+            files.write_image(path, image)
+        else:
+            about = f"{box.name}, {face}, run {box.run}, digest {box.digest[:16]}"
+            files.write_text(path, screen_page(image, about))
+        dpi = float(MM * screen.px_per_mm[0])
+        told = (
+            f"Wrote {path}: {face} of {box.name}, {size[0]:.1f} x {size[1]:.1f} mm "
+            f"on {self.pixels} pixels, {dpi:.1f} an inch"
+        )
+        document = {
+            "output": str(path),
+            "box": box.name,
+            "face": face,
+            "size_mm": [*map(float, size)],
+            "pixels_per_inch": dpi,
         }
+        return Result(document, lambda: print(told))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportRoutes:
+    """Write routes of the CARLA leaderboard as a routes file.
+
+    Each route follows the lanes of its town from position to position; needs CARLA's
+    client, but no server.
+    """
+
+    routes_xml: tyro.conf.Positional[Path]
+    """Routes of the leaderboard (.xml)."""
+    map: Path
+    """OpenDRIVE map of the town (TOWN.xodr), of CARLA's folder Maps/OpenDrive."""
+    output: Path
+    """File to write (.json)."""
+    routes: tuple[str, ...] = ()
+    """Ids of routes; all of the town by default."""
+    speed_ms: float = 5.0
+    """Nominal speed of the routes."""
+    json: bool = False
+
+    def run(self) -> Result:
+        """Follow the lanes and write."""
+        from mi_nerfattack.deploy.carla.route import town_routes
+        from mi_nerfattack.deploy.carla.session import load_client
+        from mi_nerfattack.io import files
+
+        check_suffix(self.output, ".json")
+        files.check_writable(self.output)
+        api = load_client()
+        try:
+            town_map = api.Map(self.map.stem, files.read_text(self.map))
+        except RuntimeError as error:
+            raise InputError(f"{self.map}: not an OpenDRIVE map ({error})") from error
+        found = town_routes(
+            self.routes_xml, town_map, api, self.routes, speed_ms=self.speed_ms
+        )
+        files.write_json(self.output, {route.name: route.document() for route in found})
+        told = f"Wrote {self.output}: {len(found)} routes of {self.map.stem}"
+        document = {"output": str(self.output), "routes": [r.name for r in found]}
+        return Result(document, lambda: print(told))
+
+
+@dataclass(frozen=True)
+class ExportOpenscenario:
+    """Write a found scenario as OpenSCENARIO 1.2, with the objects as glTF.
+
+    The folder has scenario.xosc, the route's lane as OpenDRIVE (route.xodr) and one
+    .glb per object.
+    """
+
+    run_folder: tyro.conf.Positional[Path]
+    output: Path
+    """Folder to write."""
+    json: bool = False
+
+    def run(self) -> Result:
+        """Read the run and write."""
+        from mi_nerfattack import variant
+        from mi_nerfattack.io import files
+        from mi_nerfattack.props.openscenario import write_openscenario
+
+        files.check_folder(self.output)
+        variant.ensure()
+        written = write_openscenario(self.run_folder, self.output)
+        names = [path.name for path in written]
+        told = f"Wrote {self.output}: {', '.join(names)}"
+        return Result({"output": str(self.output), "files": names}, lambda: print(told))

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import tyro
 
-from mi_nerfattack.commands.shared.compare_report import CompareArguments
-from mi_nerfattack.commands.shared.result import Result
+from mi_nerfattack.commands.shared.terminal import Result
 
 if TYPE_CHECKING:
     from mi_nerfattack.capture.posed_images import PosedImages
@@ -23,67 +22,61 @@ if TYPE_CHECKING:
 class Fit:
     """Fit a neural field to posed images, and score it on every 8th image.
 
-    Interrupted, by Ctrl-C or otherwise, it leaves a checkpoint; the same command goes
-    on from there.
-
-    Without --bounds the field's box is that of all depths that the folder holds or,
-    without depth, of its cameras and sparse points or, without these too, a cube around
-    the point nearest to all optical axes, four times as wide as the farthest camera is
-    away from it.
+    The same command continues an interrupted fit from its checkpoint. Without --bounds
+    the field's box is that of all depths in the folder or, without depth, of its
+    cameras and sparse points or, without these too, a cube around the point nearest to
+    all optical axes, four times as wide as the distance of the farthest camera.
     """
 
+    continues: ClassVar[bool] = True
     anew: ClassVar[tuple[str, ...]] = ("--force",)
 
     folder: tyro.conf.Positional[Path]
-    """Folder with images and transforms.json or a COLMAP model, or the JSON file; or
-    a field file (.safetensors), which is only compared with a scene."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Field file to write (.safetensors); FILE.report beside it says how good it is."""
+    """Folder with images and transforms.json or a COLMAP model, or the JSON file."""
+    output: Path
+    """Field file to write (.safetensors); FILE.report says how good it is."""
     long_edge: int | None = None
     """Reduce the images to this longer edge, pixels."""
-    epochs: float = 50.0
+    epochs: int = 50
     """Passes over the pixels; hours without a GPU, see --budget-minutes."""
     steps: int | None = None
-    """Steps of the optimiser, in place of --epochs."""
+    """Steps of the optimiser, instead of --epochs."""
     budget_minutes: float | None = None
     """End the fit after this time; the learning rate decays to fit."""
     patience: int | None = None
-    """End the fit when this many steps lower the loss by less than 1 %."""
+    """End the fit when so many steps lower the loss by less than 1 %."""
     force: bool = False
     """Start again, whatever an interrupted fit left beside the output."""
     batch_rays: int = 16384
-    """Rays a step, at most."""
+    """Rays of a step, at most."""
     network: Literal["instant-ngp", "small"] = "instant-ngp"
-    """16 levels of 2^19 entries and networks of width 64, or 10 of 2^17 and 32."""
+    """16 levels of 2^19 entries and width 64, or 10 of 2^17 and 32."""
     levels: int | None = None
-    """Levels of the hash grid, in place of the network's."""
+    """Levels of the hash grid; the network's by default."""
     log2_table: int | None = None
-    """Binary logarithm of the entries on each level, likewise."""
+    """Binary logarithm of the entries on each level."""
     max_resolution: int | None = None
-    """Resolution of the finest level, likewise; 2048 in both."""
+    """Resolution of the finest level; 2048 in both networks."""
     exposure: bool = False
-    """Learn the exposure of each image; for cameras with automatic exposure."""
+    """Learn the exposure of each image."""
     refine_poses: bool = False
     """Correct the poses of the fitted images."""
     bounds: tuple[float, float, float, float, float, float] | None = None
     """Box of the field: x0 y0 z0 x1 y1 z1, metres."""
     step_m: float | None = None
-    """Marching step near the camera; a thousandth of the longest edge by default."""
+    """March's step near the camera; a thousandth of the box by default."""
     occupancy: int | None = None
-    """Cells of the occupancy along the longest edge; 256 with depth, else 128."""
+    """Cells along the longest edge; 256 with depth, else 128."""
     no_sky: bool = False
-    """Let no light come from behind the box, as in a room: every ray must end in it."""
+    """Let no light come from behind the box, as in a room."""
     spread: float = 0.0
-    """Weight of a penalty on fog, e.g. 0.003."""
+    """Weight of a penalty on fog, for example 0.003."""
     seed: int = 0
-    """Of all random numbers."""
+    """Seed of all random numbers."""
     skip_missing: bool = False
     """Leave out frames whose image file is missing."""
-    against: Annotated[
-        CompareArguments, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="comparison")
-    ] = field(default_factory=CompareArguments)
     json: bool = False
-    """End with one line of JSON in place of the table."""
+    """End with one line of JSON instead of the table."""
 
     def _layout(self) -> NGPLayout:
         from mi_nerfattack.fields.ngp import NGPLayout
@@ -121,33 +114,16 @@ class Fit:
             **{name: str(getattr(self, name)) for name in (*names, "spread", "no_sky")},
         }
 
-    @property
-    def continues(self) -> bool:
-        """Whether the same command finds what this one left."""
-        return self.output is not None
-
     def run(self) -> Result:
-        """Fit, score, write and compare."""
+        """Fit, score and write."""
         from mi_nerfattack import variant
-        from mi_nerfattack.commands.shared.compare_report import compare_file
         from mi_nerfattack.commands.shared.fit_report import begun_fit
-        from mi_nerfattack.errors import InputError
 
         variant.ensure()
-        self.against.check()
-        if self.folder.suffix == ".safetensors":
-            if self.output is not None:
-                raise InputError(
-                    f"--output: {self.output}; {self.folder} is a field already, which "
-                    "is only compared (--compare), leave --output out"
-                )
-            return compare_file(self.folder, self.against)
-        if self.output is None:
-            raise InputError("--output: missing; give the field file to write (-o)")
         with begun_fit(self.output) as checkpoint:
-            return self._fit(self.output, checkpoint)
+            return self._fit(checkpoint)
 
-    def _fit(self, output: Path, checkpoint: Path) -> Result:
+    def _fit(self, checkpoint: Path) -> Result:
         from mi_nerfattack.capture.inputs import find_bounds, read_depth
         from mi_nerfattack.capture.transforms import read_images
         from mi_nerfattack.commands.shared.fit_report import finish, show_fit
@@ -176,11 +152,9 @@ class Fit:
         return finish(
             result,
             images,
-            output,
+            self.output,
             provenance,
             checkpoint,
-            depth,
-            self.against,
         )
 
 

@@ -4,77 +4,98 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from mi_nerfattack.commands.shared.box_options import make_screen
 from mi_nerfattack.commands.shared.terminal import say
+from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
-    from mi_nerfattack.robot.attacked import AttackedBox, Views
-    from mi_nerfattack.robot.follow import StandingScreen
-    from mi_nerfattack.robot.monitor import Screen
+    from mi_nerfattack.props.attacked import AttackedBox, Views
+    from mi_nerfattack.props.follow import StandingScreen
+    from mi_nerfattack.props.monitor import Screen
 
 
-@dataclass(frozen=True)
-class Monitor:
+@dataclass(frozen=True, kw_only=True)
+class ScreenOptions:
+    """The box, and the monitor that shows it."""
+
+    run_folder: tyro.conf.Positional[Path]
+    box: str | None = None
+    """Id of the box; the only one by default."""
+    face: Literal["front", "right", "back", "left", "top", "bottom"] | None = None
+    """Face of the box, front towards -y; the one seen most by default."""
+    diagonal_in: float = 27.0
+    """Diagonal of the monitor, inches."""
+    aspect: str = "16:9"
+    """Its width to height, WIDTH:HEIGHT."""
+    pixels: str = "2560x1440"
+    """Its pixels, WIDTHxHEIGHT."""
+    background: tuple[int, int, int] = (0, 0, 0)
+    """Colour around the box, 0 to 255."""
+    gamma: float | None = None
+    """Exponent of the monitor's curve; that of sRGB by default."""
+
+    def _make_screen(self) -> Screen:
+        """Return the monitor; InputError where its numbers are wrong."""
+        from mi_nerfattack.props.monitor import Screen, check_levels
+
+        across, down = _pair("--aspect", self.aspect, ":")
+        width, height = map(round, _pair("--pixels", self.pixels, "x"))
+        check_levels(self.background)
+        return Screen(width, height, self.diagonal_in, across / down, self.gamma)
+
+
+def _pair(name: str, text: str, mark: str) -> tuple[float, float]:
+    """Read two positive numbers with a mark between them."""
+    try:
+        first, second = map(float, text.lower().split(mark))
+    except ValueError as err:
+        raise InputError(f"{name}: {text!r}; two numbers, as in 16{mark}9") from err
+    if not (0 < first < 1e6 and 0 < second < 1e6):
+        raise InputError(f"{name}: {text}; must be positive")
+    return first, second
+
+
+@dataclass(frozen=True, kw_only=True)
+class Monitor(ScreenOptions):
     """Show the attacked cube of a run on a monitor as the car's camera would see it.
 
-    Serves a page, which draws the cube's faces anew with each pose of the tracker: to
+    Serves a page, which draws the cube's faces again with each pose of the tracker: to
     the camera, the cube stands where the attack left it. Until Ctrl-C.
     """
 
-    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """Folder of a finished run of attack."""
     tracker: str
-    """vicon:HOST[:PORT], this computer's address in the tracker's network,
-    motioncapture:KIND:HOST, or replay:FILE."""
+    """vicon:HOST[:PORT], motioncapture:KIND:HOST, or replay:FILE. The host of VICON is
+    this computer's address in the tracker's network."""
     tracker_sender: str | None = None
-    """Address of VICON's computer, by default that of the first that sends."""
+    """Address of VICON's computer; that of the first that sends by default."""
     rotation: Literal["euler", "rotation-vector"] = "euler"
     """VICON's convention."""
     body: str = "racecar"
-    """The tracker's name of the car; its frame as for drive. The camera sits on it as
-    the run's scenario says."""
-    object: str | None = None
-    """Id of the box; the only one by default."""
-    face: Literal["front", "right", "back", "left", "top", "bottom"] | None = None
-    """The monitor stands where this face of the box is, middle on middle; the one that
-    the run's drives saw most by default."""
+    """The tracker's name of the car, with the camera as in the run's scenario."""
     screen: tuple[float, float, float, float] | None = None
-    """The monitor stands elsewhere, upright: X Y Z of the picture's middle, metres, and
-    the direction that it faces, degrees from the x axis."""
-    diagonal_in: float = 27.0
-    """Inches."""
-    aspect: str = "16:9"
-    """Width to height, WIDTH:HEIGHT."""
-    pixels: str = "2560x1440"
-    """WIDTHxHEIGHT."""
-    background: tuple[int, int, int] = (0, 0, 0)
-    """Around the box, 0 to 255."""
-    gamma: float | None = None
-    """Exponent of the monitor's curve; that of sRGB by default."""
+    """Middle of an upright picture, X Y Z, metres, and the direction that it faces,
+    degrees from the x axis; the middle of --face by default."""
     listen: str = "127.0.0.1:8000"
-    """HOST:PORT of the page; other computers reach it by this one's address alone."""
+    """HOST:PORT of the page; 0.0.0.0 for other computers."""
 
     def run(self) -> int:
         """Read the box, follow, and serve."""
         from contextlib import closing
 
         from mi_nerfattack import variant
+        from mi_nerfattack.car.tracker.open import open_tracker
+        from mi_nerfattack.io.network import Endpoint
+        from mi_nerfattack.props.attacked import read_box
+        from mi_nerfattack.props.follow import FollowServer, follow_page
         from mi_nerfattack.render.camera.intrinsics import camera_to_body
-        from mi_nerfattack.robot.attacked import read_box
-        from mi_nerfattack.robot.follow import FollowServer, follow_page
-        from mi_nerfattack.robot.monitor import check_levels
-        from mi_nerfattack.robot.remote.sealed import Endpoint
-        from mi_nerfattack.robot.tracker.open import open_tracker
 
-        screen = make_screen(self.aspect, self.pixels, self.diagonal_in, self.gamma)
-        check_levels(self.background)
+        screen = self._make_screen()
         endpoint = Endpoint.parse(self.listen)
         variant.ensure()
-        box, views = read_box(self.run_folder, self.object)
+        box, views = read_box(self.run_folder, self.box)
         standing = self._standing(screen, box, views)
         page = follow_page(standing, box, self.background)
         camera = camera_to_body(views.mount)[:3, 3]
@@ -100,8 +121,8 @@ class Monitor:
         import numpy as np
 
         from mi_nerfattack.errors import InputError
-        from mi_nerfattack.robot.attacked import seen_most
-        from mi_nerfattack.robot.follow import StandingScreen
+        from mi_nerfattack.props.attacked import seen_most
+        from mi_nerfattack.props.follow import StandingScreen
 
         if self.screen is None:
             face = self.face or seen_most(box, views)

@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import tyro
 
 from mi_nerfattack.commands.shared.options import check_empty
-from mi_nerfattack.commands.shared.result import Result
+from mi_nerfattack.commands.shared.terminal import Result
 
 if TYPE_CHECKING:
     import numpy as np
 
     from mi_nerfattack.deploy.replay.recording import AbstractRecording
-    from mi_nerfattack.robot.overlay import Overlay
+    from mi_nerfattack.props.overlay import Overlay
 
 
 @dataclass(frozen=True)
@@ -30,17 +30,18 @@ class OverlayCommand:
     recording: tyro.conf.Positional[Path]
     """Video with a pose file of the same name beside it, folder of images with
     transforms.json, poses.csv or poses.toml, or .mcap log, as for replays."""
-    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """Folder of a finished run of attack."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    run_folder: tyro.conf.Positional[Path]
+    output: Path
     """FILE.mp4, or a new or empty folder for PNG images."""
-    object: str | None = None
+    box: str | None = None
     """Id of the box; the only one by default."""
     paste: bool = False
     """Show it by its pose alone, with no green target; what the recording's depth, if
     it has any, says is nearer stays before it."""
+    topics: tuple[str, ...] = ()
+    """Topics of a log: image=/front camera_pose=/pose vehicle_pose=/odom
+    calibration=/info."""
     json: bool = False
-    """End with one line of JSON in place of the sentence."""
 
     def run(self) -> Result:
         """Read, project and write."""
@@ -51,16 +52,18 @@ class OverlayCommand:
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.deploy.replay.environment import open_recording
+        from mi_nerfattack.deploy.replay.mcap import McapTopics
         from mi_nerfattack.io import files, locks
         from mi_nerfattack.io.video import check_fps, write_video
-        from mi_nerfattack.robot.attacked import read_box
-        from mi_nerfattack.robot.overlay import Overlay
+        from mi_nerfattack.props.attacked import read_box
+        from mi_nerfattack.props.overlay import Overlay
 
         is_video = self._check_output()
         variant.ensure()
-        box, views = read_box(self.run_folder, self.object)
+        box, views = read_box(self.run_folder, self.box)
+        topics = McapTopics.parse(self.topics)
         recording = open_recording(
-            self.recording, views.camera, views.mount, views.period
+            self.recording, views.camera, views.mount, views.period, topics
         )
         alone = (
             nullcontext() if is_video else locks.claimed(self.output, "choose another")

@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import tyro
 
-from mi_nerfattack.commands.shared.result import Result
+from mi_nerfattack.commands.shared.options import Settings
+from mi_nerfattack.commands.shared.terminal import Result
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,7 +25,7 @@ class _Render:
 
     scene: tyro.conf.Positional[str]
     """Scene file (.xml), or bundled:FILE."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    output: Path
     """What is written."""
     sensor: int = 0
     """Which of the scene's sensors, from 0."""
@@ -36,10 +37,8 @@ class _Render:
     """Width and height in pixels, in place of the film's."""
     precision: Literal["half", "float"] = "half"
     """Of colour and opacity in .exr; everything else is float."""
-    parameters: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set")
-    ] = ()
-    """NAME=VALUE for a <default> of the scene; may be repeated."""
+    settings: Settings = ()
+    """Set a <default> of the scene: relit=true."""
     json: bool = False
     """End with one line of JSON in place of the sentences."""
 
@@ -53,12 +52,13 @@ class _Render:
 
     def _parameters(self) -> dict[str, str]:
         from mi_nerfattack.errors import InputError
+        from mi_nerfattack.io.overrides import split_setting
 
         result: dict[str, str] = {}
-        for item in self.parameters:
-            name, equals, value = item.partition("=")
-            if not name or not equals or name in result:
-                raise InputError(f"--set {item}: needs NAME=VALUE, each name once")
+        for setting in self.settings:
+            name, value = split_setting(setting)
+            if name in result:
+                raise InputError(f"--set {setting}: {name} is set twice; set it once")
             result[name] = value
         return result
 
@@ -123,11 +123,11 @@ class RenderPath(_Render):
     path: Path | None = None
     """Camera path: transforms.json (OpenGL camera to world, images not needed)."""
     route: str | None = None
-    """Camera path: drive this route of --routes at its speed."""
-    routes: str | None = None
+    """Camera path: drive this route of --routes-file at its speed."""
+    routes_file: Path | None = None
     """Routes file (.json), or bundled:FILE."""
     mount: tuple[float, float, float] = (1.4, 0.5, 6.0)
-    """With --route: camera's height and place ahead (metres), pitch down (degrees)."""
+    """Camera's height and place ahead (metres), pitch down (degrees), of --route."""
     fps: float = 25.0
     """Frames per second of .mp4 and of --route."""
     force: bool = False
@@ -152,8 +152,8 @@ class RenderPath(_Render):
         suffix = self.output.suffix.lower()
         if (self.path is None) == (self.route is None):
             raise InputError("--path, --route: give one of both, a camera path")
-        if (self.route is None) != (self.routes is None):
-            raise InputError("--route, --routes: one without the other; give both")
+        if (self.route is None) != (self.routes_file is None):
+            raise InputError("--route, --routes-file: one without the other; give both")
         if suffix in (".exr", ".png"):
             raise InputError(
                 f"{self.output}: one image cannot hold a camera path; give .mp4, or "
@@ -175,8 +175,8 @@ class RenderPath(_Render):
 
         if self.path is not None:
             return read_path(self.path)
-        assert self.route is not None and self.routes is not None
-        route = Route.from_file(resolve(self.routes), self.route)
+        assert self.route is not None and self.routes_file is not None
+        route = Route.from_file(resolve(str(self.routes_file)), self.route)
         return route_path(route, CameraMount(*self.mount), self.fps)
 
     def _write(self, shot: Shot) -> Result:

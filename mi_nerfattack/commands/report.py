@@ -8,12 +8,15 @@ from typing import Annotated
 
 import tyro
 
-from mi_nerfattack.commands.shared.result import Result
+from mi_nerfattack.commands.shared.terminal import Result
 
 
 @dataclass(frozen=True)
 class Report:
     """Write one HTML page of results, which needs no network and no other file.
+
+    If OUTPUT ends with .md, the figures of one sweep or transfer are written between
+    two marks of that page, and their tables beside it; other text stays.
 
     Figures with flags first, drives from above, damage against cost, the matrix of
     transfers, what the policy sees, frame by frame, the objects from all around, when
@@ -26,27 +29,35 @@ class Report:
     ]
     """Finished run folders of attack, folders of sweep and transfer, and files
     NAME-retrain.json of retrain, any of them together."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """HTML file to write."""
+    output: Path
+    """HTML file to write, or Markdown file."""
+    tuning: Path | None = None
+    """For .md: folder of the sweep that settings of the methods were chosen by."""
     title: str | None = None
     """Of the page; made of names of what it shows by default."""
     json: bool = False
-    """End with one line of JSON in place of the sentence."""
 
     def run(self) -> Result:
         """Read, render the objects and write."""
         from tempfile import TemporaryDirectory
 
         from mi_nerfattack import variant
+        from mi_nerfattack.commands.shared.options import check_suffix
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.errors import InputError
-        from mi_nerfattack.experiment.page.folders import read_folders
-        from mi_nerfattack.experiment.page.write import write_page
+        from mi_nerfattack.experiment.page.markdown import write_markdown
+        from mi_nerfattack.experiment.page.write import read_folders, write_page
         from mi_nerfattack.io import files
 
-        if self.output.suffix.lower() not in (".html", ".htm"):
-            raise InputError(f"--output: {self.output}; name an .html file")
+        check_suffix(self.output, ".html", ".htm", ".md")
         files.check_writable(self.output)
+        if self.output.suffix == ".md":
+            if len(self.folders) != 1:
+                raise InputError("FOLDER: pages of Markdown are of one each")
+            write_markdown(self.output, self.folders[0], self.tuning)
+            return self._written()
+        if self.tuning is not None:
+            raise InputError("--tuning: is for pages of Markdown; leave it out")
         variant.ensure()
         with StageBars() as bars, TemporaryDirectory() as scratch:
 
@@ -55,6 +66,10 @@ class Report:
 
             parts = read_folders(self.folders, Path(scratch), say)
             write_page(self.output, parts, Path(scratch), self.title)
+        return self._written()
+
+    def _written(self) -> Result:
         path, size = self.output.resolve(), self.output.stat().st_size
-        told = f"Written: {path} ({size / 1e6:.1f} MB)"
+        amount = f"{size / 1e6:.1f} MB" if size > 1e6 else f"{size / 1e3:.1f} kB"
+        told = f"Written: {path} ({amount})"
         return Result({"output": str(path), "bytes": size}, lambda: print(told))

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from mi_nerfattack.commands.shared.result import Result
+from mi_nerfattack.commands.shared.terminal import Result
 
 
 @dataclass(frozen=True)
@@ -24,14 +24,14 @@ class Reproduce:
     """
 
     folder: tyro.conf.Positional[Path]
-    """Folder with results.parquet: a sweep's, or a copy of that file alone."""
+    """Folder with results.csv and cells.json: a sweep's, or a copy of both files."""
     row: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="ROW")]
     """Rows: index in the table, from 0, or CELL:ENVIRONMENT:CASE:RUN."""
     rows: int = 0
     """Draw so many rows at random, too."""
     seed: int = 0
     """Of these."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    output: Path | None = None
     """Folder for the repeated cells, itself a sweep's: the same command continues
     there. By default one that is removed at the end."""
     drives_only: bool = False
@@ -66,7 +66,7 @@ class Reproduce:
             sentences,
             take_checkpoints,
         )
-        from mi_nerfattack.experiment.sweep.table import read_table
+        from mi_nerfattack.experiment.sweep.table import read_made, read_table
         from mi_nerfattack.io import files
         from mi_nerfattack.system.workers import Processes
 
@@ -84,7 +84,8 @@ class Reproduce:
                 take_checkpoints(wanted, self.folder, output)
             sweep = do_cells(wanted.cells, output, self.cores, workers)
             errors = {wanted.cells[i].id: told for i, told in sweep.errors.items()}
-            found = compare_rows(wanted, read_table(sweep.table), errors)
+            again, made = read_table(sweep.table), read_made(output)
+            found = compare_rows(wanted, again, made, errors)
         code = int(bool(errors) or self._is_exceeded(found))
         return Result(found, lambda: print(*sentences(found), sep="\n"), code)
 
@@ -98,7 +99,7 @@ class Reproduce:
         if self.output.resolve() == self.folder.resolve():
             raise InputError(f"{self.output}: the sweep's own folder; choose another")
         if (path := self.output / RESULTS).exists():
-            held = {row["cell"] for row in read_table(path, ["cell"])}
+            held = set(read_table(path)["cell"])
             if others := held.difference(wanted):
                 raise InputError(
                     f"{path}: has rows of other cells, such as {min(others)}, which "

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
-from mi_nerfattack.commands.shared.result import Result
-from mi_nerfattack.commands.shared.terminal import console
-from mi_nerfattack.commands.shared.words import command_line
+from mi_nerfattack.commands.shared.options import command_line
+from mi_nerfattack.commands.shared.terminal import Result, console
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
@@ -46,7 +45,7 @@ class Retrain:
         tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN...")
     ]
     """Folders of finished runs of attack, on one policy of 'train', in one place."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    output: Path
     """Policy file to write (.safetensors)."""
     data: Path
     """Folder of new frames and checkpoints; made if missing."""
@@ -69,12 +68,12 @@ class Retrain:
     """Images a training step."""
     learning_rate: float = 5e-4
     """Largest learning rate."""
-    runs: int = 2
-    """Drives of each route and environment, without objects, at the end."""
+    card_runs: int = 2
+    """Drives of each route and environment of the policy's card, without objects."""
     environments: tuple[str, ...] = ("surrogate", "mitsuba")
     """Environments of the drives before and after, as of 'transfer'."""
-    starts: int = 4
-    """Drives before and after: of each run, past its attack and without objects."""
+    runs: int = 4
+    """Drives before and after of each case: past an attack, and without objects."""
     adaptive: bool = False
     """Attack the new policy in the same scenarios, too, which takes as long as the
     runs did, and drive past what that finds."""
@@ -118,7 +117,7 @@ class Retrain:
         sites, old = self._sites(place, settings), groups[OLD]
         routes = list({found.route.name: found.route for found in old}.values())
         names, workers = self.environments, chosen_workers(self.workers, False)
-        drives = Comparison(groups, names, self.starts, self.spp, self.data)
+        drives = Comparison(groups, names, self.runs, self.spp, self.data)
         with StageBars() as bars:
             if not more:
                 bars.say("no --more: trained on new frames alone, it may forget others")
@@ -145,7 +144,7 @@ class Retrain:
         """Check that all can be written; return where the comparison is."""
         from mi_nerfattack.commands.shared.fit_report import check_output
         from mi_nerfattack.io import files
-        from mi_nerfattack.policy.exported.program import SUFFIX
+        from mi_nerfattack.policy.exported import SUFFIX
 
         check_output(self.output)
         about = self.output.with_name(f"{self.output.stem}-retrain.json")
@@ -245,7 +244,7 @@ class Retrain:
                 self.epochs, self.batch, learning_rate=self.learning_rate
             ),
             validation=drives,
-            final=replace(drives, runs=self.runs, seed=1),
+            final=replace(drives, runs=self.card_runs, seed=1),
         )
 
 
@@ -261,19 +260,8 @@ def _describe(
     return {
         "schema": 1,
         "policy": {"file": policy.name, "sha256": files.sha256(policy)},
-        "runs": [_about(found) for found in groups[OLD]],
-        "held_out": [_about(found) for found in groups.get(HELD_OUT, ())],
-        "adaptive": [_about(found) for found in anew],
+        "runs": [found.about for found in groups[OLD]],
+        "held_out": [found.about for found in groups.get(HELD_OUT, ())],
+        "adaptive": [found.about for found in anew],
         "left_out": others,
-    }
-
-
-def _about(found: FoundAttack) -> dict[str, Any]:
-    return {
-        "label": found.label,
-        "scenario": found.scenario.name,
-        "seed": found.scenario.seed,
-        "route": found.route.name,
-        "objects": [item.id for item in found.scenario.objects],
-        "found_sha256": found.digest,
     }

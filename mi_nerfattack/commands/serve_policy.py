@@ -1,46 +1,38 @@
-"""``mi-nerfattack car serve``: a policy for a car on another computer."""
+"""``mi-nerfattack car serve``: a policy over HTTP, for a car or for `evaluate`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from mi_nerfattack.commands.shared.evaluate_options import PolicyOptions
-from mi_nerfattack.commands.shared.result import Result
-from mi_nerfattack.commands.shared.terminal import say
-
-if TYPE_CHECKING:
-    from mi_nerfattack.robot.remote.server import Control
+from mi_nerfattack.commands.shared.options import Settings
+from mi_nerfattack.commands.shared.policy_file import PolicyFile
+from mi_nerfattack.commands.shared.terminal import Result, say
 
 
 @dataclass(frozen=True)
 class ServePolicy:
-    """Decide for a car that sends its frames, until Ctrl-C.
+    """Serve a policy over HTTP until Ctrl-C.
 
-    One car at a time. Without --key it listens on this computer alone.
+    The car on another computer drives by `car drive --policy http://HOST:PORT`. Without
+    --token-file the server listens on this computer alone.
     """
 
     policy: tyro.conf.Positional[str | None] = None
-    """Policy: .safetensors of train, .pt2, .pt, .onnx, FILE.py:NAME, a URL, or a TOML
-    file with the section [policy] of a scenario; the bundled policy by default."""
-    listen: str = "127.0.0.1:7447"
+    """Policy as of evaluate; the bundled one by default."""
+    settings: Settings = ()
+    """Set a key of the policy: policy.kind=callable, policy.trust_code=true."""
+    listen: str = "127.0.0.1:8000"
     """HOST:PORT of this computer, as the car reaches it."""
-    key: Path | None = None
-    """File with the key that the car has, too; needed for other computers."""
-    route_goal: int = 0
-    """Goal of the route that is driven, as its file says it."""
+    token_file: Path | None = None
+    """File with the token that clients must send; needed for other computers."""
     size: tuple[int, int] | None = None
-    """Width and height of the car's frames: tries the policy on a black one first, so
+    """Width and height of the car's frames: tries the policy on a black frame first, so
     that the first decision is as quick as the others."""
     json: bool = False
-    """End with one line of JSON: decisions, and how old their frames were."""
-    options: Annotated[
-        PolicyOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="policy")
-    ] = PolicyOptions()
-    """How the policy is called."""
+    """End with one line of JSON: decisions, how quick they were, requests refused."""
 
     def run(self) -> Result:
         """Load, listen, and serve."""
@@ -50,28 +42,35 @@ class ServePolicy:
 
         from mi_nerfattack import variant
         from mi_nerfattack.errors import InputError
-        from mi_nerfattack.robot.drive.pilot import policy_control
-        from mi_nerfattack.robot.remote.sealed import Endpoint, read_key
-        from mi_nerfattack.robot.remote.server import PolicyServer
+        from mi_nerfattack.io.network import Endpoint, read_token, require_token
+        from mi_nerfattack.policy.http.server import PolicyServer
 
         endpoint = Endpoint.parse(self.listen)
-        key = read_key(self.key, endpoint)
+        token = "" if self.token_file is None else read_token(self.token_file)
+        require_token(token, endpoint)
         if self.size is not None and min(self.size) < 1:
             raise InputError(f"--size: {self.size}; width and height, 1 or more")
         variant.ensure()
-        policy = self.options.section(self.policy).build()
-
-        def make_control() -> Control:
-            return policy_control(policy, self.route_goal)
-
+        policy = PolicyFile.read(self.policy, self.settings).section.build()
         if self.size is not None:
-            width, height = self.size
-            make_control()(np.zeros((height, width, 3), np.uint8))
+            import mitsuba as mi
 
-        with closing(PolicyServer(endpoint, key, make_control, say)) as server:
-            sealed = "sealed by the key" if key else "on this computer alone"
-            say(f"Serving at {endpoint}, {sealed}; Ctrl-C ends")
+            black = mi.TensorXf(np.zeros((1, *self.size[::-1], 3), np.float32))
+            policy.step(black, 0, policy.initial_memory(1))
+        with closing(PolicyServer(endpoint, policy, token)) as server:
+            asked = "asks for the token" if token else "on this computer alone"
+            say(f"Serving at http://{endpoint}, {asked}; Ctrl-C ends")
             with suppress(KeyboardInterrupt):
-                server.run()
-            told = f"Ended: {server.summary()}"
-        return Result(server.figures(), lambda: say(told))
+                server.serve_forever()
+            figures = server.figures()
+        return Result(figures, lambda: say(_summary(figures)))
+
+
+def _summary(figures: dict[str, float]) -> str:
+    refused = f"refused {figures['strangers']} requests without the token"
+    if not figures["decisions"]:
+        return f"Ended: no decisions; {refused}"
+    return (
+        f"Ended: {figures['decisions']} decisions, {1e3 * figures['median_s']:.1f} ms "
+        f"in the median, 95 % within {1e3 * figures['within_s_95']:.1f} ms; {refused}"
+    )

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-import tyro
-
-from mi_nerfattack.commands.shared.evaluate_options import parse_scales
-from mi_nerfattack.commands.shared.result import Result
-from mi_nerfattack.commands.shared.terminal import console
-from mi_nerfattack.commands.shared.words import command_line
+from mi_nerfattack.commands.shared.evaluate_options import (
+    PlaceOptions,
+    parse_scales,
+)
+from mi_nerfattack.commands.shared.options import command_line
+from mi_nerfattack.commands.shared.terminal import Result, console
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
@@ -42,32 +42,30 @@ class Train:
 
     continues: ClassVar[bool] = True
 
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    output: Path
     """Policy file to write (.safetensors)."""
     data: Path
     """Folder of frames and checkpoints; made if missing."""
     preset: str = "laptop"
-    """Sizes of all that is not given here: laptop (about 10,000 frames), intersection
-    (192,000) or room (21,584), the last two as in the paper."""
+    """Sizes of all that is not given: laptop, intersection or room."""
     scene: Path | None = None
-    """Mitsuba XML of the scene, which needs --routes; the preset's by default."""
+    """Mitsuba scene (.xml); needs --routes-file."""
     field: Path | None = None
-    """Field file of the scene, for the surrogate; the preset's by default."""
+    """Field file of the scene, for the surrogate."""
     object: tuple[Path, ...] = ()
-    """Grid fields that stand beside the road; the bundled hydrant by default."""
-    routes: Path | None = None
-    """Routes, JSON; the preset's by default."""
+    """Grid fields beside the road; the bundled hydrant by default."""
+    routes_file: Path | None = None
+    """Routes file (.json); the preset's by default."""
     frames: dict[str, int] | None = None
-    """Frames by environment, as in: --frames surrogate 4096 mitsuba 6144."""
+    """Frames by environment: surrogate 4096 mitsuba 6144."""
     validation_frames: dict[str, int] | None = None
-    """Frames of a collection of their own for the held-out loss, by environment."""
+    """Frames of a collection for the held-out loss."""
     more: tuple[Path, ...] = ()
-    """Folders of earlier collections whose frames are trained on, too."""
+    """Folders of earlier collections to train on, too."""
     start: Path | None = None
-    """Policy whose weights training starts with; random ones by default."""
+    """Policy whose weights training starts with."""
     skies: tuple[str, ...] = ()
-    """Times of day of rendered frames: day, morning, noon, evening, overcast; all by
-    default, of a scene of your own the day alone."""
+    """Times of day, as of evaluate; all by default."""
     exposures_ev: tuple[float, ...] = ()
     """Exposures of rendered frames, in powers of two."""
     spp: int = 4
@@ -75,35 +73,33 @@ class Train:
     epochs: int | None = None
     """Passes over the frames."""
     batch: int = 64
-    """Images a training step."""
+    """Images of a training step."""
     learning_rate: float = 1e-3
     """Largest learning rate."""
     dagger_rounds: int | None = None
     """Rounds in which the policy drives and the expert labels."""
     dagger_frames: dict[str, int] | None = None
-    """Frames of each round, by environment."""
+    """Frames of each round."""
     dagger_epochs: int | None = None
     """Passes over all frames after a round."""
     validate_every: int = 4
-    """Epochs from one validation in the closed loop to the next."""
+    """Epochs between two validations in the closed loop."""
     validate_in: tuple[str, ...] = ()
-    """Environments of these validations; all that are used by default."""
+    """Their environments; all that are used by default."""
     runs: int = 2
     """Drives of each case of the last validation."""
     most_objects: int | None = None
-    """Most objects beside the road in a frame; each number from 1 is equally likely."""
+    """Most objects beside the road in a frame."""
     scale: tuple[float, ...] = ()
-    """Least and most factor to the natural size: of all objects, or of each --object in
-    turn, as in 1 1 0.8 1.3; the preset's by default."""
+    """Least and most factor to the size, as of evaluate."""
     objects: tuple[int, ...] = (1,)
-    """Numbers of objects of random texture beside the road in the last validation."""
+    """Numbers of objects in the last validation."""
     workers: int | None = None
     """Processes that collect; one a core by default."""
     seed: int = 0
-    """Of all random numbers."""
+    """Seed of all random numbers."""
     json: bool = False
-    """End with one line of JSON, the record that lies beside the policy, in place of
-    the table."""
+    """End with one line of JSON, the policy's record."""
 
     def run(self) -> Result:
         """Collect, train, validate and write."""
@@ -111,7 +107,7 @@ class Train:
         from mi_nerfattack.commands.shared.fit_report import check_output
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.io import files
-        from mi_nerfattack.policy.exported.program import SUFFIX
+        from mi_nerfattack.policy.exported import SUFFIX
         from mi_nerfattack.policy.pilotnet import PilotNet
         from mi_nerfattack.report.table import card_table
         from mi_nerfattack.system.workers import Processes, available_cores
@@ -165,21 +161,16 @@ class Train:
         routes_picture(picture, place.scene, routes, *look, sensor, title)
 
     def _place(self, preset: Preset) -> Place:
-        from dataclasses import replace
-
         from mi_nerfattack.deploy.place import bundled_place
 
-        place = bundled_place(preset.place)
-        if self.scene is not None:  # the bundled field is not of this scene
-            if self.routes is None:
-                raise InputError(f"--scene: {self.scene}; it needs its --routes")
-            place = replace(place, scene=self.scene, field=None)
-        return replace(
-            place,
-            field=self.field or place.field,
-            objects=self.object or place.objects,
-            routes=self.routes or place.routes,
-        )
+        objects = self.object or bundled_place(preset.place).objects
+        return PlaceOptions(
+            place=preset.place,
+            scene=self.scene,
+            field=self.field,
+            routes_file=self.routes_file,
+            object=objects,
+        ).build()
 
     def _sites(
         self, preset: Preset, place: Place, settings: ImitationSettings

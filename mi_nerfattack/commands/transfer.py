@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
-from mi_nerfattack.commands.shared.result import Result
-from mi_nerfattack.commands.shared.terminal import console
+from mi_nerfattack.commands.shared.terminal import Result, console
 
 if TYPE_CHECKING:
-    from mi_nerfattack.experiment.transfer.work import TransferWork
+    from mi_nerfattack.experiment.transfer.work import TransferDrives
 
 
 @dataclass(frozen=True)
@@ -31,9 +30,12 @@ class Transfer:
     run_folders: Annotated[
         tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN...")
     ]
-    """Folders of finished runs of attack."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Folders of finished runs of attack; with --best, those of sweeps, too."""
+    output: Path
     """Folder for table, picture and drives; one of an earlier transfer goes on."""
+    best: int | None = None
+    """Attacks of each route of the sweeps, those with the largest errors in the
+    surrogate; of a method at a place the better one alone."""
     environments: tuple[str, ...] = (
         "surrogate",
         "mitsuba",
@@ -60,13 +62,13 @@ class Transfer:
         "turn:10",
         "pitch:1",
     )
-    """Conditions: times of day, exposure (powers of two), noise (sRGB, of 1), blur
-    (pixels), dropped (share of frames), late (frames) and latency (controls) in control
-    periods, errors of placement (metres) and turn (degrees) of objects and of the
-    camera's pitch (degrees); several at once with commas: evening,noise:0.03."""
+    """Times of day, exposure (powers of two), noise (sRGB, of 1), blur (pixels),
+    dropped (share of frames), late (frames) and latency (controls) in control periods,
+    errors of placement (metres) and turn (degrees) of objects and of the camera's pitch
+    (degrees); several at once with commas: evening,noise:0.03."""
     cases: tuple[str, ...] = ("no_object", "own", "best_random", "attack")
     """What objects show."""
-    starts: int = 4
+    runs: int = 4
     """Drives of each case, environment and condition."""
     seed: int = 1
     """Of starts, images and errors."""
@@ -82,7 +84,7 @@ class Transfer:
         """Drive, summarise, print and write."""
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.progress import StageBars
-        from mi_nerfattack.experiment.transfer.run import check_output, run_transfer
+        from mi_nerfattack.experiment.transfer.figures import check_output, run_transfer
         from mi_nerfattack.io import files
         from mi_nerfattack.report.plots.transfer import quality_condition
         from mi_nerfattack.report.table import quality_table, transfer_table
@@ -97,8 +99,10 @@ class Transfer:
         workers = chosen_workers(self.workers, alone)
         check_output(self.output)
         with StageBars() as bars:
-            count = self.starts * len(work.batches)
-            bars.say(f"{len(work.rows)} rows, {count} drives, kept in {work.folder}")
+            count = self.runs * len(work.batches)
+            bars.say(
+                f"{len(work.rows)} rows, {count} drives, kept in {work.store.folder}"
+            )
             progress = bars.counter("driving", "step ")
             document = run_transfer(work, self.output, workers, progress)
 
@@ -112,14 +116,17 @@ class Transfer:
 
         return Result(document, show)
 
-    def _work(self) -> TransferWork:
+    def _work(self) -> TransferDrives:
         """Check everything that can be checked before the first drive."""
+        from mi_nerfattack.drives.store import Store
+        from mi_nerfattack.experiment.transfer.best import chosen_runs
         from mi_nerfattack.experiment.transfer.columns import make_columns
+        from mi_nerfattack.experiment.transfer.figures import DRIVES
         from mi_nerfattack.experiment.transfer.found import read_found
-        from mi_nerfattack.experiment.transfer.run import DRIVES
-        from mi_nerfattack.experiment.transfer.work import TransferWork
+        from mi_nerfattack.experiment.transfer.work import TransferDrives
 
         columns = make_columns(self.environments, self.conditions, self.spp)
-        attacks, folder = read_found(self.run_folders), self.output / DRIVES
-        choices = self.cases, self.starts, self.seed
-        return TransferWork(attacks, columns, *choices, folder)
+        runs = chosen_runs(self.run_folders, self.best)
+        attacks, store = read_found(runs), Store(self.output / DRIVES)
+        choices = self.cases, self.runs, self.seed
+        return TransferDrives(store, attacks, columns, *choices)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import tyro
 
@@ -24,15 +24,15 @@ class View:
 
     run_folder: tyro.conf.Positional[Path]
     """Finished run folder of attack."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    output: Path | None = None
     """Write one HTML file, which opens by itself, and end: the scene, with one drive
     that plays."""
     drive: str | None = None
     """Shown first, or written: ENVIRONMENT: CASE, as "deployment: attack"; past the
     attack in the surrogate by default."""
     host: str = "127.0.0.1"
-    """Name or address to listen at. Whoever gets there sees the run, and moves its
-    objects: this computer alone, by default."""
+    """Name or address to listen at. Whoever gets there sees the run and moves its
+    objects: this computer alone by default."""
     port: int = 8080
     """TCP port to listen at; 0 for any that is free."""
     open: bool = False
@@ -54,9 +54,9 @@ class View:
         import webbrowser
 
         from mi_nerfattack.commands.shared.progress import StageBars
-        from mi_nerfattack.experiment.view.server import serving
+        from mi_nerfattack.experiment.view.page import serving
         from mi_nerfattack.experiment.view.viewer import Viewer
-        from mi_nerfattack.robot.remote.sealed import Endpoint
+        from mi_nerfattack.io.network import Endpoint
 
         with serving(self.host, self.port) as server:
             with StageBars() as bars:
@@ -71,13 +71,12 @@ class View:
                 print("Ended", flush=True)
 
     def _write(self, output: Path) -> None:
+        from mi_nerfattack.commands.shared.options import check_suffix
         from mi_nerfattack.commands.shared.progress import StageBars
-        from mi_nerfattack.errors import InputError
         from mi_nerfattack.experiment.view.page import write_view
         from mi_nerfattack.io import files
 
-        if output.suffix.lower() not in (".html", ".htm"):
-            raise InputError(f"--output: {output}; name an .html file")
+        check_suffix(output, ".html", ".htm")
         files.check_writable(output)
         with StageBars() as bars:
             write_view(output, self._read(bars), bars.counter("frames", "frame "))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Acute, ControlUnit, Positive, checked
+from mi_nerfattack.render.camera.intrinsics import CameraMount
 
 
 @dataclass(frozen=True)
@@ -60,3 +61,6 @@ SMALL_CAR = Car(
     control_unit="rad",
     max_control=0.4,
 )
+
+#: Where the camera is on the small car of the bundled room.
+SMALL_CAR_MOUNT = CameraMount(0.2, forward_m=0.3, pitch_deg=10.0)

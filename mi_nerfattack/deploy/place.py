@@ -5,14 +5,59 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from scipy.stats import truncnorm
+
 from mi_nerfattack.deploy.built_in import BuiltInObject
-from mi_nerfattack.deploy.car import CAR, SMALL_CAR, Car
-from mi_nerfattack.deploy.kinematic import Motion
+from mi_nerfattack.deploy.car import CAR, SMALL_CAR, SMALL_CAR_MOUNT, Car
+from mi_nerfattack.deploy.vehicle import Motion
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.ranges import Count, Finite, NonNegative, Seconds, checked
+from mi_nerfattack.ranges import Count, Finite, NonNegative, Seconds, Share, checked
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.render.pathtrace.daylight import DAYLIGHT
+from mi_nerfattack.render.pathtrace.load import DAYLIGHT
+from mi_nerfattack.vehicle.route.route import Route
+
+
+@dataclass(frozen=True)
+@checked("Scatter")
+class Scatter:
+    """Deviations of vehicles from the lane centre, normal and cut.
+
+    Args:
+        lateral_sd_m, lateral_max_m: offset to the left, metres; 0 for none.
+        heading_sd, heading_max: angle to the route, radians; 0 for none.
+        close_share: share of the vehicles whose deviations are a fifth of the drawn.
+    """
+
+    lateral_sd_m: NonNegative = 0.5
+    lateral_max_m: NonNegative = 1.5
+    heading_sd: NonNegative = 0.12
+    heading_max: NonNegative = 0.4
+    close_share: Share = 0.4
+
+    def states(
+        self, route: Route, arc: np.ndarray, rng: np.random.Generator
+    ) -> np.ndarray:
+        """Draw states (n, 3) at arc lengths (n,), metres."""
+        count = len(arc)
+        factor = np.where(rng.uniform(size=count) < self.close_share, 0.2, 1.0)
+        lateral = cut_normal(self.lateral_sd_m, self.lateral_max_m, count, rng)
+        heading = cut_normal(self.heading_sd, self.heading_max, count, rng)
+        states = route.pose_at(arc, factor * lateral)
+        # the route's own heading jumps at the vertices of the polyline
+        states[:, 2] = route.heading_at(arc) + factor * heading
+        return states
+
+
+def cut_normal(
+    sd: float, largest: float, count: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Draw (count,) normal numbers of standard deviation `sd` within +-largest."""
+    if sd == 0 or largest == 0:
+        return np.zeros(count)
+    cut = largest / sd
+    return sd * np.asarray(truncnorm.rvs(-cut, cut, size=count, random_state=rng))
 
 
 @dataclass(frozen=True)
@@ -33,6 +78,7 @@ class Place:
         motion: how, where an environment has no physics; the car's kinematic model by
             default.
         recording: of `replay`: a folder, a video or a log.
+        topics: of such a log, "NAME=/topic", see `McapTopics`.
         server: of `carla`: "HOST:PORT" or "HOST:PORT/TOWN".
     """
 
@@ -46,6 +92,7 @@ class Place:
     car: Car = CAR
     motion: Motion | None = None
     recording: Path | None = None
+    topics: tuple[str, ...] = ()
     server: str = "127.0.0.1:2000"
     field_pose: Pose | None = None
 
@@ -73,7 +120,6 @@ class Conditions:
     noise_sd: NonNegative = 0.0
 
     def __post_init__(self) -> None:
-        """Check the sky."""
         if self.sky not in DAYLIGHT:
             raise InputError(f"sky: {self.sky!r}; one of {', '.join(DAYLIGHT)}")
 
@@ -104,5 +150,5 @@ def bundled_place(name: str = "intersection") -> Place:
 #: Cars of the bundled places, where their cameras are, and what stands there.
 _CARS = {
     "intersection": (CAR, CameraMount(), "hydrant"),
-    "room": (SMALL_CAR, CameraMount(0.2, forward_m=0.3, pitch_deg=10.0), "cube"),
+    "room": (SMALL_CAR, SMALL_CAR_MOUNT, "cube"),
 }

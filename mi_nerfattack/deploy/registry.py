@@ -7,18 +7,16 @@ from collections.abc import Callable, Mapping
 
 from mi_nerfattack.deploy.built_in import built_in_shapes
 from mi_nerfattack.deploy.environment import AbstractEnvironment
-from mi_nerfattack.deploy.kinematic import KinematicVehicle, Motion
 from mi_nerfattack.deploy.place import Conditions, Place
 from mi_nerfattack.deploy.simulated import AbstractSimulation, SimulatedEnvironment
 from mi_nerfattack.deploy.surrogate.environment import SurrogateEnvironment
 from mi_nerfattack.deploy.surrogate.scene import field_sensor
-from mi_nerfattack.deploy.vehicle import AbstractVehicle
-from mi_nerfattack.deploy.views.base import AbstractView
+from mi_nerfattack.deploy.vehicle import AbstractVehicle, KinematicVehicle, Motion
 from mi_nerfattack.deploy.views.mitsuba import MitsubaView
+from mi_nerfattack.deploy.views.paste import AbstractView
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.io import load_field
-from mi_nerfattack.render.pathtrace.daylight import set_daylight
-from mi_nerfattack.render.pathtrace.load import load_scene
+from mi_nerfattack.render.pathtrace.load import load_scene, set_daylight
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.vehicle.dynamics import Ackermann, Dubins
 
@@ -100,6 +98,7 @@ def _replay(place: Place, conditions: Conditions) -> AbstractEnvironment:
         ReplayEnvironment,
         open_recording,
     )
+    from mi_nerfattack.deploy.replay.mcap import McapTopics
 
     if place.recording is None:
         raise InputError(
@@ -108,7 +107,13 @@ def _replay(place: Place, conditions: Conditions) -> AbstractEnvironment:
         )
     _refuse_built_in("replay", conditions)
     _refuse_disturbed("replay", conditions)
-    recording = open_recording(place.recording, place.camera, place.mount, place.period)
+    recording = open_recording(
+        place.recording,
+        place.camera,
+        place.mount,
+        place.period,
+        McapTopics.parse(place.topics),
+    )
     car = place.car
     return ReplayEnvironment(
         recording, place.mount, place.period, car.max_control, car.control_unit

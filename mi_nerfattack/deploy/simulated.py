@@ -7,12 +7,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
+from mi_nerfattack.deploy.environment import (
+    AbstractEnvironment,
+    CameraFrame,
+    policy_image,
+)
 from mi_nerfattack.deploy.vehicle import AbstractVehicle, checked_pose
-from mi_nerfattack.deploy.views.base import AbstractView
+from mi_nerfattack.deploy.views.paste import AbstractView
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.disturbance import disturbed
 from mi_nerfattack.render.camera.intrinsics import (
@@ -74,7 +77,7 @@ class AbstractSimulation(AbstractEnvironment):
         """Blur the image of a frame and add noise, in eight bits."""
         if not (self.blur_px or self.noise_sd):
             return frame
-        image = mi.TensorXf(np.divide(frame.image[None], 255, dtype=np.float32))
+        image = policy_image(frame.image)
         zero, draw = np.zeros(1), (self.noise_sd, self._seed, self._steps)
         seen = np.array(disturbed(image, zero, zero + self.blur_px, *draw))[0]
         image = np.round(255 * seen).astype(np.uint8)

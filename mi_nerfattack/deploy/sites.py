@@ -23,9 +23,9 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.io import load_grid
 from mi_nerfattack.io import files
+from mi_nerfattack.render.camera.conventions import to_colmap
 from mi_nerfattack.render.camera.intrinsics import Camera
-from mi_nerfattack.render.pathtrace.daylight import DAYLIGHT
-from mi_nerfattack.render.pathtrace.load import load_scene, scene_files
+from mi_nerfattack.render.pathtrace.load import DAYLIGHT, load_scene, scene_files
 from mi_nerfattack.vehicle.expert import AbstractExpert, expert_for
 from mi_nerfattack.vehicle.route.route import Route, load_routes
 
@@ -202,7 +202,7 @@ class PlaceSite(AbstractSite):
         return {
             "environment": self.name,
             "files": _checksums(paths),
-            "camera": asdict(place.camera),
+            "camera": to_colmap(place.camera)[1],
             "mount": asdict(place.mount),
             "car": asdict(place.car),
             "period": place.period,
@@ -224,7 +224,6 @@ def probe_expert(site: AbstractSite, route: Route) -> list[float]:
     """Return an expert's controls beside a route's middle, which tell experts apart."""
     expert, controls = expert_of(site, route), []
     for lateral, heading in ((0.1, 0.0), (-0.2, 0.05), (0.0, -0.1)):
-        expert.reset()
         state = route.pose_at(route.length / 2, lateral, heading)
         controls.append(round(float(expert.control(state)[0]), 4))
     return controls

@@ -14,29 +14,28 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.backend.determinism import one_thread
-from mi_nerfattack.deploy.driving import drive
-from mi_nerfattack.deploy.environment import AbstractEnvironment
+from mi_nerfattack.deploy.environment import AbstractEnvironment, drive
+from mi_nerfattack.deploy.place import Scatter
 from mi_nerfattack.deploy.roadside.rule import Roadside
 from mi_nerfattack.deploy.roadside.surroundings import Surroundings
-from mi_nerfattack.deploy.scatter import Scatter
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.metrics import card_figures
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.random_textures import random_texture
-from mi_nerfattack.policy.base import AbstractPolicy, Memory
+from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.ranges import Count, Whole, checked
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.rollout.drive import (
+    EXPERT,
     NO_OBJECT,
     Drive,
     departure_limits,
     random_case,
 )
+from mi_nerfattack.system.workers import tally
 from mi_nerfattack.vehicle.expert import AbstractExpert
 from mi_nerfattack.vehicle.route.route import Route
 
-#: The case of the expert's drives, which is none of its own in a card.
-EXPERT = "expert"
 #: Of the starts: 0.25 m and 3 degrees, cut at three times as much.
 STARTS = Scatter(0.25, 0.75, np.deg2rad(3.0).item(), np.deg2rad(9.0).item(), 0.0)
 
@@ -109,12 +108,6 @@ class ExpertPolicy(AbstractPolicy):
     ) -> None:
         self.environment, self.expert = environment, expert
 
-    def initial_memory(self, count: int) -> Memory:
-        """Let the expert forget the drive before."""
-        self.expert.reset()
-        del count
-        return ()
-
     def control(self, image: Any, goal: Any) -> Any:
         """Ask the expert."""
         del image, goal
@@ -131,6 +124,14 @@ def random_start(
 ) -> np.ndarray:
     """Draw a pose (3,) near the start of a route, metres and radians."""
     return settings.scatter.states(route, np.zeros(1), rng)[0]
+
+
+def drawn_start(
+    settings: EvaluateSettings, route: Route, run: int
+) -> tuple[np.ndarray, int]:
+    """Return the pose (3,) from which a drive starts, and its seed."""
+    rng = _generator(settings, route, run, 0)
+    return random_start(route, settings, rng), int(rng.integers(2**31))
 
 
 def evaluate_run(
@@ -150,17 +151,16 @@ def evaluate_run(
         environment: shows nothing but its world afterwards.
         policy: drives.
         route: from its start.
-        case: one of the settings'.
+        case: one of the settings', or `EXPERT`.
         run: number of the drive, from 0.
         objects: stand beside the road, in turns; their own textures come back.
         surroundings: of the objects; None in the case without.
         settings: see there.
         on_step: called after each step.
     """
-    rng = _generator(settings, route, run, 0)
-    pose, seed = random_start(route, settings, rng), int(rng.integers(2**31))
+    pose, seed = drawn_start(settings, route, run)
     steps = settings.steps(route, environment.period)
-    count = settings.counts[case]
+    count = 0 if case == EXPERT else settings.counts[case]
     with own_textures(objects if count else ()):
         posed = place_objects(
             environment.period, route, count, run, objects, surroundings, settings
@@ -217,16 +217,10 @@ def evaluate(
     ]
     total = sum(settings.steps(route, env.period) for env, route, _, _ in jobs)
     drives: dict[tuple[str, str, str], list[Drive]] = {}
-    done = 0
-
-    def count(step: int) -> None:
-        nonlocal done
-        done += 1
-        progress(done, total)
-
+    count = tally(progress, 0, total)
     for environment, route, case, run in jobs:
-        arguments = (case, run, objects, surroundings, settings, count)
-        found = evaluate_run(environment, policy, route, *arguments)
+        about = case, run, objects, surroundings, settings
+        found = evaluate_run(environment, policy, route, *about, lambda step: count(1))
         drives.setdefault((environment.name, route.name, case), []).append(found)
     return make_card(drives, limits)
 

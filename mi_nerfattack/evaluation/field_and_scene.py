@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -17,7 +17,14 @@ from pydantic import Field
 
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy
 from mi_nerfattack.fields.base import AbstractField
-from mi_nerfattack.fit.scores import SOLID, FieldRenderer, Rendering, compare
+from mi_nerfattack.fit.scores import (
+    SOLID,
+    FieldRenderer,
+    ViewScore,
+    keep_worst,
+    least,
+    mean,
+)
 from mi_nerfattack.ranges import Positive, Whole, checked
 from mi_nerfattack.render.camera.intrinsics import (
     Camera,
@@ -61,51 +68,6 @@ class CompareOptions:
     worst: Whole = 2
 
 
-@dataclass(frozen=True)
-class Station:
-    """Agreement of one frame.
-
-    Attributes:
-        arc_m: arc length along the route.
-        psnr_db: of sRGB values in [0, 1], field against path-traced frame.
-        ceiling_db: PSNR that the noise of the path-traced frame alone would leave.
-        ssim: as in `evaluation.ViewScore`.
-        depth_median_m, depth_p90_m: quantiles of |z_field - z_scene| over the near
-            rays; infinite where the field shows nothing, NaN without near rays.
-        wrong: share of rays that the field stops (opacity of at least 0.5) and the
-            scene does not, or the other way round.
-        hazy: see `evaluation.Rendering.hazy`.
-        holes: see `FieldRenderer.holes`.
-    """
-
-    arc_m: float
-    psnr_db: float
-    ceiling_db: float
-    ssim: float
-    depth_median_m: float
-    depth_p90_m: float
-    wrong: float
-    hazy: float
-    holes: float
-
-
-@dataclass(frozen=True, eq=False)
-class ComparedFrame:
-    """A frame as both show it.
-
-    Attributes:
-        station: its agreement.
-        field: the field's frame.
-        image: (height, width, 3), float32 sRGB, path-traced.
-        depth: (height, width), metres along the ray, infinite in the sky.
-    """
-
-    station: Station
-    field: Rendering
-    image: np.ndarray
-    depth: np.ndarray
-
-
 @dataclass(frozen=True, eq=False)
 class RouteComparison:
     """Agreement along one route.
@@ -113,34 +75,30 @@ class RouteComparison:
     Attributes:
         name: of the route.
         length_m: of the route.
-        stations: in order of arc length.
+        stations: in order of arc length; depth is compared on the near rays.
         depth_median_m, depth_p90_m: quantiles of |z_field - z_scene| over all near
             rays of the route; infinite where the field shows nothing, NaN without
             near rays.
         depth_median_relative, depth_p90_relative: the same of |z_field / z_scene - 1|.
         near: share of near rays.
-        worst: frames of least PSNR, worst first.
     """
 
     name: str
     length_m: float
-    stations: tuple[Station, ...]
+    stations: tuple[ViewScore, ...]
     depth_median_m: float
     depth_p90_m: float
     depth_median_relative: float
     depth_p90_relative: float
     near: float
-    worst: tuple[ComparedFrame, ...]
 
     def mean(self, name: str) -> float:
-        """Return the mean of a number over the stations; NaN ones do not count."""
-        values = np.array([getattr(station, name) for station in self.stations])
-        known = values[~np.isnan(values)]
-        return float(np.mean(known)) if known.size else float("nan")
+        """Return the mean of a figure over the stations that have it."""
+        return mean(self.stations, name)
 
     def least(self, name: str) -> float:
-        """Return the least value of a number over the stations."""
-        return float(min(getattr(station, name) for station in self.stations))
+        """Return the least value of a figure over the stations."""
+        return least(self.stations, name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,16 +142,23 @@ def compare_with_scene(
     started = time.perf_counter()
     options = options or CompareOptions()
     routes = load_routes(routes_path)
-    eyes = _Eyes(surrogate, load_scene(scene_path), options)
+    eyes = _Eyes(
+        FieldRenderer(surrogate),
+        ViewRenderer(load_scene(scene_path), options.camera),
+        options,
+    )
     arcs = [_stations(route.length, options.spacing_m) for route in routes]
     total, done, result = sum(map(len, arcs)), 0, []
     for route, stops in zip(routes, arcs, strict=True):
-        tally = _Tally(route, options)
+        stations: list[ViewScore] = []
+        errors: list[np.ndarray] = []
         for arc in stops:
-            tally.add(eyes.frame(route, float(arc), done))
+            station, error = eyes.compare(route, float(arc), done)
+            stations = keep_worst([*stations, station], options.worst)
+            errors.append(error)
             done += 1
             progress(done, total)
-        result.append(tally.result())
+        result.append(_along(route, stations, np.hstack(errors), options.camera))
     return Comparison(tuple(result), options, time.perf_counter() - started)
 
 
@@ -202,82 +167,62 @@ def _stations(length: float, spacing: float) -> np.ndarray:
     return np.linspace(0, length, int(np.ceil(length / spacing - 1e-9)) + 1)
 
 
+@dataclass(frozen=True)
 class _Eyes:
     """The field and the scene from the same poses."""
 
-    def __init__(
-        self, surrogate: AbstractField, scene: object, options: CompareOptions
-    ) -> None:
-        self.options = options
-        self._field = FieldRenderer(surrogate)
-        self._scene = ViewRenderer(scene, options.camera)
+    field: FieldRenderer
+    scene: ViewRenderer
+    options: CompareOptions
 
-    def frame(self, route: Route, arc: float, index: int) -> ComparedFrame:
+    def compare(
+        self, route: Route, arc: float, index: int
+    ) -> tuple[ViewScore, np.ndarray]:
+        """Return the score of a station, and its `depth_errors`."""
         options = self.options
         state = route.pose_at(arc, options.lateral_m)
         pose = mount_matrix(state, options.mount)[0]
         seeds = np.random.SeedSequence([options.seed, index]).generate_state(2)
         spp = -(-options.spp // 2)
-        views = [self._scene.render(pose, spp, int(seed)) for seed in seeds]
+        views = [self.scene.render(pose, spp, int(seed)) for seed in seeds]
         image = linear_to_srgb_numpy(0.5 * (views[0].rgb + views[1].rgb))
         halves = [linear_to_srgb_numpy(view.rgb).astype(np.float64) for view in views]
         noise = float(np.mean((halves[0] - halves[1]) ** 2)) / 4  # of their mean
-        shown, depth = self._field.render(options.camera, pose), views[0].depth
-        errors = depth_errors(shown.depth, depth, options.near_m)[0]
-        psnr, ssim = compare(shown.image, image)
-        station = Station(
-            arc,
-            psnr,
-            -10 * float(np.log10(noise)) if noise > 0 else float("inf"),
-            ssim,
-            quantile(errors, 0.5),
-            quantile(errors, 0.9),
-            float(np.mean((shown.opacity >= SOLID) != np.isfinite(depth))),
-            shown.hazy,
-            self._field.holes(shown, options.camera, pose, depth),
+        name, depth = f"at {arc:.1f} m", views[0].depth
+        score = self.field.score(name, options.camera, pose, image, depth=depth)
+        assert score.pictures is not None
+        shown = score.pictures.shown
+        errors = depth_errors(shown.depth, depth, options.near_m)
+        station = replace(
+            score,
+            route=route.name,
+            arc_m=arc,
+            lateral_m=options.lateral_m,
+            ceiling_db=-10 * float(np.log10(noise)) if noise > 0 else float("inf"),
+            depth_median_m=quantile(errors[0], 0.5),
+            depth_p90_m=quantile(errors[0], 0.9),
+            wrong=float(np.mean((shown.opacity >= SOLID) != np.isfinite(depth))),
         )
-        return ComparedFrame(station, shown, image, depth)
+        return station, errors
 
 
-class _Tally:
-    """What is kept of the frames of a route."""
-
-    def __init__(self, route: Route, options: CompareOptions) -> None:
-        self.route, self.options = route, options
-        self.stations: list[Station] = []
-        self.worst: list[ComparedFrame] = []
-        self.errors: list[np.ndarray] = []
-        self.relative: list[np.ndarray] = []
-
-    def add(self, frame: ComparedFrame) -> None:
-        self.stations.append(frame.station)
-        frames = sorted([*self.worst, frame], key=lambda item: item.station.psnr_db)
-        self.worst = frames[: self.options.worst]
-        near_m = self.options.near_m
-        error, relative = depth_errors(frame.field.depth, frame.depth, near_m)
-        self.errors.append(error)
-        self.relative.append(relative)
-
-    def result(self) -> RouteComparison:
-        error, relative = np.concatenate(self.errors), np.concatenate(self.relative)
-        camera = self.options.camera
-        rays = len(self.stations) * camera.width * camera.height
-        return RouteComparison(
-            self.route.name,
-            self.route.length,
-            tuple(self.stations),
-            quantile(error, 0.5),
-            quantile(error, 0.9),
-            quantile(relative, 0.5),
-            quantile(relative, 0.9),
-            len(error) / rays,
-            tuple(self.worst),
-        )
+def _along(
+    route: Route, stations: Sequence[ViewScore], errors: np.ndarray, camera: Camera
+) -> RouteComparison:
+    error, relative = errors
+    return RouteComparison(
+        name=route.name,
+        length_m=route.length,
+        stations=tuple(stations),
+        depth_median_m=quantile(error, 0.5),
+        depth_p90_m=quantile(error, 0.9),
+        depth_median_relative=quantile(relative, 0.5),
+        depth_p90_relative=quantile(relative, 0.9),
+        near=len(error) / (len(stations) * camera.width * camera.height),
+    )
 
 
-def depth_errors(
-    shown: np.ndarray, depth: np.ndarray, near_m: float
-) -> tuple[np.ndarray, np.ndarray]:
+def depth_errors(shown: np.ndarray, depth: np.ndarray, near_m: float) -> np.ndarray:
     """Return |z - z_scene| and |z / z_scene - 1| of the rays nearer than `near_m`.
 
     Args:
@@ -289,7 +234,7 @@ def depth_errors(
     near = depth < near_m
     wanted = depth[near].astype(np.float64)
     error = np.abs(shown[near] - wanted)
-    return error, error / wanted
+    return np.stack([error, error / wanted])
 
 
 def quantile(values: np.ndarray | Sequence[float], share: float) -> float:

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.deploy.place import Conditions, Place
 from mi_nerfattack.deploy.sites import PlaceSite, Weather
+from mi_nerfattack.drives import spec
 from mi_nerfattack.evaluation.evaluate import EvaluateSettings
-from mi_nerfattack.scenario.named_file import NamedFile
+from mi_nerfattack.io.resumable import json_digest
+from mi_nerfattack.scenario.named_file import section_content
 from mi_nerfattack.scenario.policy import AbstractPolicySection
-from mi_nerfattack.scenario.section import Section
 from mi_nerfattack.scenario.vehicle import AbstractVehicleSection
 from mi_nerfattack.vehicle.route.route import Route
-
-FORMAT = "mi_nerfattack evaluated drive 4"
 
 
 @dataclass(frozen=True)
@@ -53,7 +49,7 @@ def identify(
     """Describe all that decides about the drives of each environment and route.
 
     Args:
-        policy: as of `EvaluateWork`, and so are the others.
+        policy: as of `EvaluateDrives`, and so are the others.
         place: likewise.
         environments: likewise.
         routes: likewise.
@@ -61,33 +57,23 @@ def identify(
         vehicle: likewise.
 
     Returns:
-        by label of the environment and name of the route, for `resumable.Unit`.
+        by label of the environment and name of the route.
 
     Raises:
         InputError: a file cannot be read.
     """
-    shared = {
-        "format": FORMAT,
-        "policy": _digest("policy", section_content(policy)),
-        **{f"version.{name}": value for name, value in versions().items()},
-    }
+    shared: dict[str, Any] = {"policy": json_digest(section_content(policy))}
     if vehicle is not None:
-        shared["vehicle"] = _digest("vehicle", section_content(vehicle))
-    worlds = {
-        under.label: PlaceSite(under.name, place, _weather(under.conditions)).describe()
-        for under in environments
-    }
-    choices = {**asdict(settings), "runs": None, "objects": None}
-    return {
-        (under.label, route.name): {
-            **shared,
-            "environment": _digest(under.label, worlds[under.label]),
-            "route": _digest(route.name, _route_content(route)),
-            "settings": json.dumps(choices, sort_keys=True),
-        }
-        for under in environments
-        for route in routes
-    }
+        shared["vehicle"] = json_digest(section_content(vehicle))
+    shared["settings"] = {**asdict(settings), "runs": None, "objects": None}
+    found = {}
+    for under in environments:
+        site = PlaceSite(under.name, place, _weather(under.conditions))
+        shared["environment"] = json_digest(site.describe())
+        for route in routes:
+            shared["route"] = json_digest(_route_content(route))
+            found[under.label, route.name] = spec.identify(under.name, shared)
+    return found
 
 
 def _weather(conditions: Conditions) -> Weather:
@@ -95,30 +81,6 @@ def _weather(conditions: Conditions) -> Weather:
 
 
 def _route_content(route: Route) -> list[Any]:
-    values = [route.goal, route.lane_width_m, route.speed_ms, route.closed]
+    """Return what decides of a route; its name seeds starts and textures."""
+    values = [route.name, route.goal, route.lane_width_m, route.speed_ms, route.closed]
     return [*values, route.points.tolist()]
-
-
-def section_content(section: Section) -> dict[str, Any]:
-    """Return what a policy's or vehicle's section says as JSON, files by checksums."""
-    values = section.model_dump(mode="json", exclude_defaults=True)
-    for (key, *_), value in section.leaves():
-        if isinstance(value, NamedFile):
-            values.pop(str(key))
-            values[f"{key}_sha256"] = value.content()["sha256"]
-    return values
-
-
-def _digest(name: str, value: Any) -> str:
-    """Return a value's checksum, in the form that `resumable` takes for a file's."""
-    text = json.dumps(value, sort_keys=True)
-    return json.dumps({"file": name, "sha256": _sha256(text.encode())})
-
-
-def _sha256(raw: bytes) -> str:
-    return hashlib.sha256(raw).hexdigest()
-
-
-def short_digest(identity: Mapping[str, str]) -> str:
-    """Return 12 hexadecimal digits that tell one identity from another."""
-    return _sha256(json.dumps(identity, sort_keys=True).encode())[:12]

@@ -7,17 +7,37 @@ width: the car then touches the lane's edge.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated, Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
-import numpy as np
+import pandas as pd
 import pydantic
 
+from mi_nerfattack.drives.table import drives_table, lane_of, records, with_starts
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.evaluation.intervals import mean_interval, share_interval
+from mi_nerfattack.evaluation.summary import summary
+from mi_nerfattack.ranges import Count, NonNegative, Positive, Share, Whole
 from mi_nerfattack.rollout.drive import CASES, ENVIRONMENTS, RANDOM, Drive, Lane
 
 SCHEMA = 2
+
+
+#: Of `per_run` in a document: the row of a drive in its table.
+_OF_RUN = (
+    *("run", "seed", "steps", "cross_track_mean_m", "cross_track_max_m"),
+    *("cross_track_total", "steps_departed", "wheel_out_s", "centre_out_s"),
+    "returned_s",
+)
+_OF_CASE = (
+    *("cross_track_mean_m", "cross_track_mean_ci95_m", "cross_track_mean_worst_run_m"),
+    *("cross_track_max_m", "cross_track_total", "steps_departed", "drives_departed"),
+    *("wheel_out_s", "centre_out_s"),
+)
+_OF_CARD = (
+    *("cross_track_mean_m", "cross_track_max_m", "drives_departed"),
+    *("cross_track_mean_ci95_m", "departure_rate_ci95"),
+)
+_GROUP = ["route", "environment", "case"]
 
 
 def summarise(
@@ -25,25 +45,14 @@ def summarise(
 ) -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
     """Summarise drives by route, environment and case.
 
-    The figures of one case of n runs, |e| being the distance from the lane centre:
+    The figures of one case are the columns of `summary` and of `drives_table`:
 
     - `n`: number of runs;
-    - `cross_track_mean_m`: mean of |e| over all steps of all runs;
-    - `cross_track_mean_ci95_m`: of `random`, where every run has a texture of its own,
-      the 95 % interval (BCa bootstrap) of the mean over runs of each run's mean of
-      |e|; null for a single run, and for cases that show one look, however many starts
-      they are driven from: starts tell nothing about other attacks;
-    - `cross_track_mean_worst_run_m`: largest of the runs' means;
-    - `cross_track_max_m`: largest |e| of any step;
-    - `cross_track_total`: plain sum of |e| over the steps of a run (unit: metre-steps,
-      so it grows when the time step shrinks), averaged over the runs;
-    - `steps_departed`: number of steps beyond the limit, summed over the runs;
-    - `drives_departed`: number of runs with at least one such step;
-    - `wheel_out_s`: seconds beyond the limit, averaged over the runs;
-    - `centre_out_s`: seconds with the car's centre out of the lane, likewise;
-    - `per_run`: the figures of each run, ordered by its index; `returned_s` is the time
-      at which it was back in the lane after its last departure, null if it never left
-      or never came back.
+    - means are over the runs, each of which counts once, whatever its length;
+    - `cross_track_mean_ci95_m`: of `random`, where each run has its own texture; null
+      for a single run, and for cases with one texture, however many starts they are
+      driven from, because starts say nothing about other attacks;
+    - `per_run`: the figures of each run, ordered by its index.
 
     Args:
         drives: in any order; lengths may differ.
@@ -56,19 +65,17 @@ def summarise(
     Raises:
         InputError: for the same run twice, or a route without a lane.
     """
-    groups: dict[tuple[str, str, str], dict[int, Drive]] = {}
-    for drive in drives:
-        key = (drive.route, drive.environment, drive.case)
-        runs = groups.setdefault(key, {})
-        if drive.run in runs:
-            raise InputError(f"{' / '.join(key)}: run {drive.run} twice; number runs")
-        runs[drive.run] = drive
+    table = drives_table(drives, lanes).sort_values("run", kind="stable")
+    table["texture"] = table["run"].where(table["case"] == RANDOM, 0)
     result: dict[str, dict[str, dict[str, dict[str, Any]]]] = {}
-    for route, environment, case in sorted(groups, key=_order):
-        runs = groups[route, environment, case]
-        ordered = [runs[index] for index in sorted(runs)]
-        figures = _case_figures(ordered, lane_of(route, lanes), seed)
-        result.setdefault(route, {}).setdefault(environment, {})[case] = figures
+    for row in sorted(records(summary(table, _GROUP, ["texture"], seed)), key=_order):
+        route, environment, case = (row[name] for name in _GROUP)
+        own = table[(table[_GROUP] == [route, environment, case]).all(axis=1)]
+        result.setdefault(route, {}).setdefault(environment, {})[case] = {
+            "n": row["drives"],
+            **{name: row[name] for name in _OF_CASE},
+            "per_run": records(own[list(_OF_RUN)]),
+        }
     return result
 
 
@@ -77,32 +84,68 @@ def card_figures(
 ) -> dict[str, Any]:
     """Summarise the drives of one environment, route and case for a policy card.
 
-    - `n`, `cross_track_mean_m`, `cross_track_max_m`, `cross_track_mean_ci95_m`: as of
-      `summarise`;
-    - `drives_departed`: number of drives that left the lane;
-    - `departure_rate_ci95`: 95 % interval of their share (Wilson);
-    - `per_run`: by run its seed and steps, its figures, its start (x, y, heading),
-      where and when its error was largest, and when it left the lane (null if it did
-      not).
+    - `n` and columns of `summary`, in which each drive counts once;
+    - `per_run`: figures of each drive, as of `drives_table`.
 
     Args:
         drives: at least one.
         limit: departure limit, metres.
         seed: of the bootstrap.
     """
-    ordered = sorted(drives, key=lambda drive: drive.run)
-    means = np.array([drive.distance_m.mean() for drive in ordered])
-    left = sum(bool(drive.departed(limit).any()) for drive in ordered)
+    lanes = {drives[0].route: Lane(limit, limit)}
+    table = drives_table(drives, lanes).sort_values("run", kind="stable")
+    [figures] = records(summary(table, _GROUP, ["run"], seed))
     return {
-        "n": len(ordered),
-        "cross_track_mean_m": float(means.mean()),
-        "cross_track_max_m": max(float(drive.distance_m.max()) for drive in ordered),
-        "drives_departed": left,
-        "cross_track_mean_ci95_m": mean_interval(means, seed),
-        "departure_rate_ci95": share_interval(left, len(ordered)),
+        "n": figures["drives"],
+        **{name: figures[name] for name in _OF_CARD},
         "departure_limit_m": limit,
-        "per_run": [_card_run(drive, limit) for drive in ordered],
+        "per_run": [
+            {
+                **{name: row[name] for name in _OF_RUN[:5]},
+                "start": [row[f"start_{k}"] for k in ("x_m", "y_m", "heading_rad")],
+                "worst_at_m": [row["worst_x_m"], row["worst_y_m"]],
+                **{k: row[k] for k in ("worst_time_s", "departed", "departed_time_s")},
+            }
+            for row in records(table)
+        ],
     }
+
+
+def cells(tree: Mapping[str, Any], *names: str) -> Iterator[dict[str, Any]]:
+    """Yield the figures in nested tables, each after the keys that lead to it.
+
+    Args:
+        tree: tables in tables, as deep as there are names.
+        names: of the keys of each table.
+    """
+    for key, value in tree.items():
+        for figures in cells(value, *names[1:]) if names[1:] else (value,):
+            yield {names[0]: key, **figures}
+
+
+def drives_of_run(document: Mapping[str, Any]) -> pd.DataFrame:
+    """Return the drives of a finished run as a table with one row per drive.
+
+    Args:
+        document: that ``metrics.json`` of the run holds.
+
+    Returns:
+        `scenario` (name), `seed` (of the scenario), `route`, `environment`, `case`,
+        `run`, `start` (index of the first pose), `drive_seed`, and the figures of
+        `per_run` with `departed`.
+    """
+    rows = [
+        {
+            "scenario": document["scenario"]["name"],
+            **{name: case[name] for name in _GROUP},
+            **{("drive_seed" if k == "seed" else k): v for k, v in run.items()},
+            "seed": document["seed"],
+        }
+        for case in cells(document["routes"], *_GROUP)
+        for run in case["per_run"]
+    ]
+    table = with_starts(pd.DataFrame(rows), "scenario")
+    return table.assign(departed=table["steps_departed"] > 0)
 
 
 def metrics_document(
@@ -138,14 +181,6 @@ def metrics_document(
     return document
 
 
-def lane_of(route: str, lanes: Mapping[str, Lane]) -> Lane:
-    """Return a route's lane; InputError if it has none."""
-    if route not in lanes:
-        known = ", ".join(sorted(lanes)) or "none"
-        raise InputError(f"lanes: no lane for route {route!r}; given: {known}")
-    return lanes[route]
-
-
 def validate(document: Any) -> None:
     """Check a metrics document against schema 2.
 
@@ -167,29 +202,29 @@ class _Model(pydantic.BaseModel):
 
 
 class _Run(_Model):
-    run: pydantic.NonNegativeInt
-    seed: pydantic.NonNegativeInt
-    steps: pydantic.PositiveInt
-    cross_track_mean_m: pydantic.NonNegativeFloat
-    cross_track_max_m: pydantic.NonNegativeFloat
-    cross_track_total: pydantic.NonNegativeFloat
-    steps_departed: pydantic.NonNegativeInt
-    wheel_out_s: pydantic.NonNegativeFloat
-    centre_out_s: pydantic.NonNegativeFloat
-    returned_s: pydantic.PositiveFloat | None
+    run: Whole
+    seed: Whole
+    steps: Count
+    cross_track_mean_m: NonNegative
+    cross_track_max_m: NonNegative
+    cross_track_total: NonNegative
+    steps_departed: Whole
+    wheel_out_s: NonNegative
+    centre_out_s: NonNegative
+    returned_s: Positive | None
 
 
 class _Case(_Model):
-    n: pydantic.PositiveInt
-    cross_track_mean_m: pydantic.NonNegativeFloat
-    cross_track_mean_ci95_m: list[pydantic.NonNegativeFloat] | None
-    cross_track_mean_worst_run_m: pydantic.NonNegativeFloat
-    cross_track_max_m: pydantic.NonNegativeFloat
-    cross_track_total: pydantic.NonNegativeFloat
-    steps_departed: pydantic.NonNegativeInt
-    drives_departed: pydantic.NonNegativeInt
-    wheel_out_s: pydantic.NonNegativeFloat
-    centre_out_s: pydantic.NonNegativeFloat
+    n: Count
+    cross_track_mean_m: NonNegative
+    cross_track_mean_ci95_m: list[NonNegative] | None
+    cross_track_mean_worst_run_m: NonNegative
+    cross_track_max_m: NonNegative
+    cross_track_total: NonNegative
+    steps_departed: Whole
+    drives_departed: Whole
+    wheel_out_s: NonNegative
+    centre_out_s: NonNegative
     per_run: list[_Run]
 
     @pydantic.model_validator(mode="after")
@@ -200,13 +235,13 @@ class _Case(_Model):
 
 
 class _Cost(_Model):
-    wall_s: pydantic.NonNegativeFloat
-    peak_memory_mb: pydantic.NonNegativeFloat
-    renders: pydantic.NonNegativeInt
-    checkpoint_s: pydantic.NonNegativeFloat = 0.0
-    processes: pydantic.NonNegativeInt = 1
-    forward_s: pydantic.NonNegativeFloat = 0.0
-    backward_s: pydantic.NonNegativeFloat = 0.0
+    wall_s: NonNegative
+    peak_memory_mb: NonNegative
+    renders: Whole
+    checkpoint_s: NonNegative = 0.0
+    processes: Whole = 1
+    forward_s: NonNegative = 0.0
+    backward_s: NonNegative = 0.0
 
 
 class _Cases(_Model):
@@ -218,18 +253,18 @@ class _Cases(_Model):
 
 
 class _Baseline(_Model):
-    textures: pydantic.PositiveInt
-    deployment_textures: pydantic.PositiveInt
-    backward_multiple: pydantic.NonNegativeFloat
-    best: pydantic.NonNegativeInt
+    textures: Count
+    deployment_textures: Count
+    backward_multiple: NonNegative
+    best: Whole
     objectives: list[float]
     attack_objective: float
 
 
 class _Curve(_Model):
-    frames: list[pydantic.PositiveInt]
+    frames: list[Count]
     objective: list[float]
-    cross_track_mean_m: list[pydantic.NonNegativeFloat]
+    cross_track_mean_m: list[NonNegative]
 
     @pydantic.model_validator(mode="after")
     def _count_rows(self) -> _Curve:
@@ -239,105 +274,44 @@ class _Curve(_Model):
         return self
 
 
-_Share = Annotated[float, pydantic.Field(ge=0, le=1)]
+class _Optimised(_Model):
+    cross_track_mean_m: NonNegative
+    field_cross_track_mean_m: NonNegative
 
 
-class _Bricks(_Model):
+class _Bricks(_Optimised):
     file: str
-    cross_track_mean_m: pydantic.NonNegativeFloat
-    field_cross_track_mean_m: pydantic.NonNegativeFloat
 
 
 class _Texture(_Model):
-    l2: pydantic.NonNegativeFloat
-    linf: pydantic.NonNegativeFloat
-    saturated_share: _Share
-    total_variation: pydantic.NonNegativeFloat
+    l2: NonNegative
+    linf: NonNegative
+    saturated_share: Share
+    total_variation: NonNegative
     spectrum: list[float]
-    picture_share: _Share | None = None
+    picture_share: Share | None = None
 
 
 class _Document(_Model):
     schema_version: int = pydantic.Field(alias="schema", ge=SCHEMA, le=SCHEMA)
     scenario: dict[str, Any]
-    seed: pydantic.NonNegativeInt
-    departure_limits_m: dict[str, pydantic.PositiveFloat]
+    seed: Whole
+    departure_limits_m: dict[str, Positive]
     routes: dict[str, dict[str, _Cases]] = pydantic.Field(min_length=1)
     cost: _Cost
     flags: list[str]
     converged: bool | None = None
-    saturated_share: _Share | None = None
-    total_variation: pydantic.NonNegativeFloat | None = None
+    saturated_share: Share | None = None
+    total_variation: NonNegative | None = None
     textures: dict[str, _Texture] | None = None
     verdict: list[str] | None = None
     baseline: _Baseline | None = None
     curve: _Curve | None = None
     bricks: _Bricks | None = None
+    one_level: _Optimised | None = None
     object_poses: dict[str, Any] | None = None
     ignored_changes: list[str] | None = None
     replay: dict[str, Any] | None = None
-
-
-def _case_figures(drives: list[Drive], lane: Lane, seed: int) -> dict[str, Any]:
-    per_run = [_run_figures(drive, lane) for drive in drives]
-    of_textures = drives[0].case == RANDOM
-    means = np.array([run["cross_track_mean_m"] for run in per_run])
-    return {
-        "n": len(drives),
-        "cross_track_mean_m": float(means.mean()),
-        "cross_track_mean_ci95_m": mean_interval(means, seed) if of_textures else None,
-        "cross_track_mean_worst_run_m": float(means.max()),
-        "cross_track_max_m": max(float(drive.distance_m.max()) for drive in drives),
-        "cross_track_total": float(np.mean([r["cross_track_total"] for r in per_run])),
-        "steps_departed": sum(run["steps_departed"] for run in per_run),
-        "drives_departed": sum(run["steps_departed"] > 0 for run in per_run),
-        "wheel_out_s": float(np.mean([r["wheel_out_s"] for r in per_run])),
-        "centre_out_s": float(np.mean([r["centre_out_s"] for r in per_run])),
-        "per_run": per_run,
-    }
-
-
-def _run_figures(drive: Drive, lane: Lane) -> dict[str, Any]:
-    out = drive.departed(lane.wheel_m)
-    beyond = drive.departed(lane.centre_m)
-    seconds = np.diff(drive.time_s, prepend=0.0)
-    return {
-        "run": drive.run,
-        "seed": drive.seed,
-        "steps": len(drive.distance_m),
-        "cross_track_mean_m": float(drive.distance_m.mean()),
-        "cross_track_max_m": float(drive.distance_m.max()),
-        "cross_track_total": float(drive.distance_m.sum()),
-        "steps_departed": int(out.sum()),
-        "wheel_out_s": float(seconds[out].sum()),
-        "centre_out_s": float(seconds[beyond].sum()),
-        "returned_s": _returned_s(drive, out),
-    }
-
-
-def _returned_s(drive: Drive, out: np.ndarray) -> float | None:
-    """Return the time of the first step after the last one that is out."""
-    steps = np.flatnonzero(out)
-    if not len(steps) or out[-1]:
-        return None
-    return float(drive.time_s[steps[-1] + 1])
-
-
-def _card_run(drive: Drive, limit: float) -> dict[str, Any]:
-    worst = int(drive.distance_m.argmax())
-    out = np.flatnonzero(drive.departed(limit))
-    return {
-        "run": drive.run,
-        "seed": drive.seed,
-        "steps": len(drive.distance_m),
-        "cross_track_mean_m": float(drive.distance_m.mean()),
-        "cross_track_max_m": float(drive.distance_m.max()),
-        "start": drive.states[0].tolist(),
-        "worst_at_m": drive.states[1 + worst, :2].tolist(),
-        "worst_time_s": float(drive.time_s[worst]),
-        "departed": bool(len(out)),
-        "departed_time_s": float(drive.time_s[out[0]]) if len(out) else None,
-    }
 
 
 def environment_order(name: str) -> tuple[int, str]:
@@ -346,5 +320,6 @@ def environment_order(name: str) -> tuple[int, str]:
     return known, name
 
 
-def _order(key: tuple[str, str, str]) -> tuple[str, tuple[int, str], int]:
-    return key[0], environment_order(key[1]), CASES.index(key[2])
+def _order(row: Mapping[str, Any]) -> tuple[str, tuple[int, str], int]:
+    case = CASES.index(row["case"])
+    return row["route"], environment_order(row["environment"]), case

@@ -7,48 +7,22 @@ attacks.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.evaluation.intervals import (
+from mi_nerfattack.evaluation.summary import (
+    DEPARTED_S,
     Interval,
     bootstrap_interval,
     interquartile_mean,
     mean_interval,
     share_interval,
 )
-from mi_nerfattack.rollout.drive import OWN
-from mi_nerfattack.scenario.deployment import SURROGATE
-
-#: An attack counts as departed from so many seconds with a wheel out on, on average.
-DEPARTED_S = 1.0
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a drive came to.
-
-    Attributes:
-        scenario: what was attacked; the same for all seeds, methods and looks.
-        seed: of the attack.
-        environment: name.
-        case: what objects showed.
-        run: index among the drives of all these.
-        start: index of the initial state.
-        figures: numbers by name, such as ``wheel_out_s``.
-    """
-
-    scenario: str
-    seed: int
-    environment: str
-    case: str
-    run: int
-    start: int
-    figures: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -112,86 +86,29 @@ class Departures:
     p_value: float
 
 
-def over_attacks(
-    errors_m: np.ndarray, wheel_out_s: np.ndarray, seed: int
-) -> dict[str, Any]:
-    """Summarise attacks, each of which counts once.
-
-    Args:
-        errors_m: (n,), the mean error of each, over its drives.
-        wheel_out_s: (n,), mean seconds with a wheel out.
-        seed: of the resampling.
-
-    Returns:
-        how many ``attacks``; mean error, its standard deviation (None of one) and BCa
-        interval; mean seconds; how many are out for `DEPARTED_S`, with Wilson's
-        interval of their share.
-    """
-    count, out = len(errors_m), int((wheel_out_s >= DEPARTED_S).sum())
-    return {
-        "attacks": count,
-        "cross_track_mean_m": float(errors_m.mean()),
-        "cross_track_sd_m": float(errors_m.std(ddof=1)) if count > 1 else None,
-        "cross_track_mean_ci95_m": mean_interval(errors_m, seed),
-        "wheel_out_s": float(wheel_out_s.mean()),
-        "attacks_out": out,
-        "attacks_out_rate_ci95": share_interval(out, count),
-    }
-
-
-def outcomes(
-    document: Mapping[str, Any],
-    environment: str,
-    case: str,
-    scenario: str | None = None,
-) -> list[Outcome]:
-    """Return the drives of one environment and case of a run.
-
-    Args:
-        document: that ``metrics.json`` of the run holds.
-        environment: driven in, in a closed loop.
-        case: of the drives.
-        scenario: what was attacked; by default its scenario's name.
-
-    Raises:
-        InputError: there are no such drives.
-    """
-    [environments] = document["routes"].values()
-    runs = (environments.get(environment, {}).get(case) or {}).get("per_run")
-    if not runs:
-        known = ", ".join(
-            f"{e} / {c}" for e, cases in environments.items() for c in cases
-        )
-        raise InputError(f"{environment} / {case}: no such drives; there are: {known}")
-    starts = environments[SURROGATE][OWN]["n"]
-    name = document["scenario"]["name"] if scenario is None else scenario
-    about = name, document["seed"], environment, case
-    return [Outcome(*about, row["run"], row["run"] % starts, row) for row in runs]
-
-
 def compare(
-    one: Iterable[Outcome], other: Iterable[Outcome], figure: str, seed: int = 0
+    one: pd.DataFrame, other: pd.DataFrame, figure: str, seed: int = 0
 ) -> Effect:
     """Compare a figure of paired drives.
 
     Args:
-        one: of one environment and case.
-        other: likewise.
-        figure: its name.
+        one: drives of one environment and case, with `scenario`, `seed`, `run` and
+            `start`, as of `metrics.drives_of_run`.
+        other: as `one`.
+        figure: name of a column.
         seed: of the resampling.
 
     Raises:
         InputError: a side mixes environments or cases, a figure is missing or not
             finite, or no drives are paired.
     """
-    keys, first, second, drives, unpaired = _paired(one, other, figure)
+    scenarios, first, second, drives, unpaired = _paired(one, other, figure)
     difference = first - second
-    scenarios = [name for name, _ in keys]
     counts = [scenarios.count(name) for name in set(scenarios)]
     means = first.mean(), second.mean()
     is_positive = bool((second > 0).all())
     return Effect(
-        attacks=len(keys),
+        attacks=len(scenarios),
         drives=drives,
         unpaired=unpaired,
         seeds=min(counts),
@@ -210,17 +127,17 @@ def compare(
 
 
 def compare_departures(
-    one: Iterable[Outcome],
-    other: Iterable[Outcome],
+    one: pd.DataFrame,
+    other: pd.DataFrame,
     figure: str = "wheel_out_s",
     least: float = DEPARTED_S,
 ) -> Departures:
     """Compare how many attacks depart, by paired drives.
 
     Args:
-        one: of one environment and case.
-        other: likewise.
-        figure: that tells.
+        one: as of :func:`compare`.
+        other: as `one`.
+        figure: name of the column of the departure.
         least: an attack departs whose mean figure is so large.
 
     Raises:
@@ -244,9 +161,12 @@ def compare_departures(
 
 
 def _paired(
-    one: Iterable[Outcome], other: Iterable[Outcome], figure: str
-) -> tuple[list[tuple[str, int]], np.ndarray, np.ndarray, int, int]:
-    """Return attacks, means (n,) of both sides, pairs of drives, starts left out."""
+    one: pd.DataFrame, other: pd.DataFrame, figure: str
+) -> tuple[list[str], np.ndarray, np.ndarray, int, int]:
+    """Return the scenario of each attack and the means (n,) of both sides.
+
+    Also how many starts were paired, and how many of either side were left out.
+    """
     first, second = _by_start(one, figure), _by_start(other, figure)
     both = sorted(first.keys() & second.keys())
     if not both:
@@ -259,31 +179,31 @@ def _paired(
         rows.setdefault(key[:2], []).append((first[key], second[key]))
     means = np.array([np.mean(pairs, axis=0) for pairs in rows.values()])
     unpaired = len(first.keys() ^ second.keys())
-    return list(rows), means[:, 0], means[:, 1], len(both), unpaired
+    return [name for name, _ in rows], means[:, 0], means[:, 1], len(both), unpaired
 
 
-def _by_start(
-    side: Iterable[Outcome], figure: str
-) -> dict[tuple[str, int, int], float]:
+def _by_start(side: pd.DataFrame, figure: str) -> dict[tuple[str, int, int], float]:
     """Return the mean figure by scenario, seed and start."""
-    found: dict[tuple[str, int, int], list[float]] = {}
-    kinds: set[str] = set()
-    seen: set[str] = set()
-    for drive in side:
-        where = f"{drive.scenario}, seed {drive.seed}, run {drive.run}"
-        value = drive.figures.get(figure)
-        if value is None or not np.isfinite(value):
-            raise InputError(f"{where}: {figure} is {value}; give a finite number")
-        key = drive.scenario, drive.seed, drive.start
-        found.setdefault(key, []).append(float(value))
-        kinds.add(f"{drive.environment} / {drive.case}")
-        if len(kinds) > 1:
-            listed = ", ".join(sorted(kinds))
-            raise InputError(f"one side has drives of {listed}; give those of one")
-        if where in seen:
+    if figure not in side:
+        raise InputError(f"no column {figure}; there are {', '.join(side.columns)}")
+    values = side[figure].to_numpy(float, na_value=np.nan)
+    wrong = ~np.isfinite(values)
+    again = side.duplicated(["scenario", "seed", "run"]).to_numpy()
+    kinds = sorted(set(side["environment"] + " / " + side["case"]))
+    if len(kinds) > 1:
+        raise InputError(f"one side has drives of {', '.join(kinds)}; give one kind")
+    if wrong.any() or again.any():
+        row = side.iloc[int((wrong | again).argmax())]
+        where = f"{row.scenario}, seed {row.seed}, run {row.run}"
+        if again.any():
             raise InputError(f"{where}: twice on one side; give one method at a time")
-        seen.add(where)
-    return {key: float(np.mean(values)) for key, values in found.items()}
+        value = values[wrong][0]
+        raise InputError(f"{where}: {figure} is {value}; give a finite number")
+    found: dict[tuple[str, int, int], list[float]] = {}
+    starts = zip(side["scenario"], side["seed"], side["start"], strict=True)
+    for key, value in zip(starts, values.tolist(), strict=True):
+        found.setdefault(key, []).append(value)
+    return {key: float(np.mean(own)) for key, own in found.items()}
 
 
 def _ratio(one: np.ndarray, other: np.ndarray, axis: int = -1) -> Any:

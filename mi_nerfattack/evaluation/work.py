@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
-from urllib.parse import quote
+from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -18,73 +17,55 @@ from mi_nerfattack.deploy.place import Place
 from mi_nerfattack.deploy.registry import environment_versions, make_environment
 from mi_nerfattack.deploy.roadside.surroundings import Surroundings
 from mi_nerfattack.deploy.sites import CARLA, PlaceSite
+from mi_nerfattack.drives.run import AbstractDriver, AbstractDrives, OnSteps, run_drives
+from mi_nerfattack.drives.spec import DriveSpec
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import (
-    EXPERT,
     EvaluateSettings,
     ExpertPolicy,
     check_places,
+    drawn_start,
     evaluate_run,
     make_card,
 )
-from mi_nerfattack.evaluation.identity import (
-    EnvironmentUnder,
-    section_content,
-    short_digest,
-)
+from mi_nerfattack.evaluation.identity import EnvironmentUnder, identify
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.io import files
-from mi_nerfattack.io.resumable import Record, Unit
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.camera.intrinsics import from_fov
-from mi_nerfattack.rollout.drive import NO_OBJECT, Drive, departure_limits
+from mi_nerfattack.rollout.drive import EXPERT, NO_OBJECT, Drive, departure_limits
+from mi_nerfattack.rollout.loop import OnStep
+from mi_nerfattack.scenario.named_file import section_content
 from mi_nerfattack.scenario.policy import AbstractPolicySection
 from mi_nerfattack.scenario.vehicle import AbstractVehicleSection
-from mi_nerfattack.system.workers import (
-    AbstractWork,
-    AbstractWorkers,
-    InThisProcess,
-    OnUnits,
-)
+from mi_nerfattack.system.workers import AbstractWorkers, InThisProcess
 from mi_nerfattack.vehicle.expert import expert_for
 from mi_nerfattack.vehicle.route.route import Route
 
-_REMEDY = "choose another folder for the drives, or remove this one"
 #: The expert sees no image: the smallest are rendered for it, of square pixels.
 _EXPERT_CAMERA = from_fov(8, 3, 90.0)
 
 
-class DriveRecord(Record):
-    """What a kept drive does not say: its seed, and the seconds that it took."""
+class _How(NamedTuple):
+    """Where a drive takes place."""
 
-    seed: int
-    wall_s: float
-
-
-@dataclass(frozen=True, eq=False)
-class Job:
-    """One drive: a case of the card, or "expert"."""
-
-    environment: EnvironmentUnder
+    under: EnvironmentUnder
     route: Route
-    case: str
-    run: int
 
 
 @dataclass(frozen=True, eq=False)
-class EvaluateWork(AbstractWork):
+class EvaluateDrives(AbstractDrives):
     """All drives of an evaluation.
 
     Args:
+        store: of those that are finished.
         policy: that drives, as a scenario describes it.
         place: where.
         environments: with different labels.
         routes: with different names.
         settings: see there.
-        folder: of the drives.
-        identities: of the drives of each environment and route, see `identify`.
         vehicle: that drives in the place's surrogate and path-traced scene, where it is
             no kinematic model of the place's car.
     """
@@ -94,8 +75,6 @@ class EvaluateWork(AbstractWork):
     environments: tuple[EnvironmentUnder, ...]
     routes: tuple[Route, ...]
     settings: EvaluateSettings
-    folder: Path
-    identities: Mapping[tuple[str, str], Mapping[str, str]]
     vehicle: AbstractVehicleSection | None = None
 
     @property
@@ -103,17 +82,38 @@ class EvaluateWork(AbstractWork):
         """Names of the cases; without objects there is one."""
         return self.settings.cases if self.place.objects else (NO_OBJECT,)
 
-    @property
-    def jobs(self) -> list[Job]:
+    @cached_property
+    def groups(self) -> Sequence[Sequence[DriveSpec]]:
         """Every drive; those of one environment and of one sort together."""
+        about = self.policy, self.place, self.environments, self.routes
+        identities = identify(*about, self.settings, self.vehicle)
         return [
-            Job(environment, route, case, run)
-            for environment in self.environments
+            [self._spec(under, route, case, run, identities[under.label, route.name])]
+            for under in self.environments
             for sort in ((EXPERT,), self.cases)
             for route in self.routes
             for case in sort
             for run in range(self.settings.runs)
         ]
+
+    def _spec(
+        self,
+        under: EnvironmentUnder,
+        route: Route,
+        case: str,
+        run: int,
+        shared: Mapping[str, str],
+    ) -> DriveSpec:
+        return DriveSpec(
+            environment=under.label,
+            route=route.name,
+            case=case,
+            run=run,
+            seed=drawn_start(self.settings, route, run)[1],
+            steps=self.settings.steps(route, self.place.period),
+            identity={**shared, "case": case, "run": f"{run}"},
+            how=_How(under, route),
+        )
 
     def build_place(self) -> Place:
         """Return the place with the vehicle's motion, which no process can send."""
@@ -121,52 +121,28 @@ class EvaluateWork(AbstractWork):
             return self.place
         return replace(self.place, motion=self.vehicle.motion())
 
-    def open(self) -> Opened:
+    def first(self, objects: Sequence[GridField], count: int) -> Sequence[GridField]:
+        """Return the objects among which a drive past `count` of them chooses."""
+        return objects[: max(len(self.place.objects), count)]
+
+    def open(self) -> EvaluateDriver:
         """Load policy, objects and their surroundings."""
-        return Opened(self)
+        return EvaluateDriver(self)
 
-    def do(self, opened: Opened, index: int, report: OnUnits) -> None:
-        """Drive once and write the drive; a unit is a control period."""
-        job, start = self.jobs[index], time.monotonic()
-        result = opened.drive(job, lambda step: report(1))
-        seconds = time.monotonic() - start
-        unit = self._unit(job)
-        files.make_folder(unit.path.parent)
-        unit.write(result.arrays(), DriveRecord(seed=result.seed, wall_s=seconds))
-
-    def close(self, opened: Opened) -> None:
-        """Close the environment."""
-        opened.close()
-
-    def path(self, job: Job) -> Path:
-        """Return the file of a drive."""
-        label, route = job.environment.label, job.route.name
-        folder = self.folder / f"{label}-{short_digest(self.identities[label, route])}"
-        parts = (quote(route, safe=""), job.case, f"run_{job.run:04d}.safetensors")
-        return folder.joinpath(*parts)
-
-    def steps(self, job: Job) -> int:
-        """Return the number of control periods of a drive."""
-        return self.settings.steps(job.route, self.place.period)
-
-    def read(self, job: Job) -> tuple[Drive, float] | None:
-        """Read a drive and its seconds; None where it was not finished.
+    def check(self, missing: Sequence[DriveSpec]) -> None:
+        """Place all objects and make each environment once.
 
         Raises:
-            InputError: the file is damaged, or of another evaluation.
+            InputError: objects find no place, or an environment cannot be made.
         """
-        kept = self._unit(job).read()
-        if kept is None:
-            return None
-        found = Drive(
-            environment=job.environment.name,
-            route=job.route.name,
-            case=NO_OBJECT if job.case == EXPERT else job.case,
-            run=job.run,
-            seed=kept.record.seed,
-            **kept.tensors,
-        )
-        return found, kept.record.wall_s
+        if any(spec.case not in (EXPERT, NO_OBJECT) for spec in missing):
+            objects, around = load_objects(self)
+            for count in self.settings.objects:
+                some = self.first(objects, count)
+                only = replace(self.settings, objects=(count,))
+                check_places(self.place.period, self.routes, some, around, only)
+        for under in dict.fromkeys(spec.how.under for spec in missing):
+            make_environment(under.name, self.build_place(), under.conditions).close()
 
     def describe(self) -> dict[str, Any]:
         """Return policy, place, routes, environments and settings, as JSON."""
@@ -198,57 +174,43 @@ class EvaluateWork(AbstractWork):
             },
         }
 
-    def _unit(self, job: Job) -> Unit[DriveRecord]:
-        shared = self.identities[job.environment.label, job.route.name]
-        identity = {**shared, "case": job.case, "run": f"{job.run}"}
-        return Unit(self.path(job), identity, DriveRecord, _REMEDY)
 
+class EvaluateDriver(AbstractDriver):
+    """Drives with the policy, or as the expert."""
 
-class Opened:
-    """What a process needs for its drives; one environment at a time."""
-
-    def __init__(self, work: EvaluateWork) -> None:
+    def __init__(self, work: EvaluateDrives) -> None:
+        super().__init__()
         self._work = work
         self._policy, self._place = work.policy.build(), work.build_place()
         self._objects, self._surroundings = load_objects(work)
-        self._key: tuple[str, bool] | None = None
-        self._environment: AbstractEnvironment | None = None
 
-    def drive(self, job: Job, on_step: Callable[[int], None]) -> Drive:
+    def drive(self, spec: DriveSpec, on_step: OnStep) -> Drive:
         """Drive once."""
-        environment = self._open(job)
-        driver, case = self._policy, job.case
-        if case == EXPERT:
-            driver, case = self._expert(environment, job.route), NO_OBJECT
+        under, route = spec.how
+        blind = spec.case == EXPERT
+        environment = self.environment.get(
+            (under.label, blind), lambda: self._make(under, blind)
+        )
+        driver = self._expert(environment, route) if blind else self._policy
+        settings = self._work.settings
         return evaluate_run(
             environment,
             driver,
-            job.route,
-            case,
-            job.run,
-            self._objects,
+            route,
+            spec.case,
+            spec.run,
+            self._work.first(self._objects, settings.counts.get(spec.case, 0)),
             self._surroundings,
-            self._work.settings,
+            settings,
             on_step,
         )
 
-    def close(self) -> None:
-        """Close the environment, where there is one."""
-        if self._environment is not None:
-            self._environment.close()
-        self._key = self._environment = None
-
-    def _open(self, job: Job) -> AbstractEnvironment:
-        blind, under = job.case == EXPERT, job.environment
-        if self._environment is None or self._key != (under.label, blind):
-            self.close()
-            place, conditions = self._place, under.conditions
-            if blind:
-                place = replace(place, camera=_EXPERT_CAMERA)
-                conditions = replace(conditions, spp=1)
-            self._environment = make_environment(under.name, place, conditions)
-            self._key = under.label, blind
-        return self._environment
+    def _make(self, under: EnvironmentUnder, blind: bool) -> AbstractEnvironment:
+        place, conditions = self._place, under.conditions
+        if blind:
+            place = replace(place, camera=_EXPERT_CAMERA)
+            conditions = replace(conditions, spp=1)
+        return make_environment(under.name, place, conditions)
 
     def _expert(self, environment: AbstractEnvironment, route: Route) -> ExpertPolicy:
         expert = expert_for(
@@ -284,9 +246,9 @@ class Evaluation:
 
 
 def run_evaluation(
-    work: EvaluateWork,
+    work: EvaluateDrives,
     workers: AbstractWorkers,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: OnSteps = lambda done, total: None,
 ) -> Evaluation:
     """Do the drives that are not there yet, and summarise all.
 
@@ -298,46 +260,25 @@ def run_evaluation(
     Raises:
         InputError: before the first drive, a lane narrower than the car, objects
             that find no place, an environment that cannot be made, several processes
-            for CARLA, drives of another evaluation in the folder, or one that cannot
-            be made; later, a policy that does not take the images.
+            for CARLA, or a damaged drive in the folder; later, a policy that does not
+            take the images.
     """
     limits = departure_limits(work.routes, work.settings.car_width_m)
     _check_workers(work, workers)
-    jobs = work.jobs
-    steps = [work.steps(job) for job in jobs]
-    found = [work.read(job) for job in jobs]
-    left = [index for index, item in enumerate(found) if item is None]
-    done, total = sum(steps) - sum(steps[index] for index in left), sum(steps)
-    # what cannot be made is told now, not after the hours of those before it
-    if any(jobs[index].case not in (EXPERT, NO_OBJECT) for index in left):
-        objects, surroundings = load_objects(work)
-        arguments = (work.routes, objects, surroundings, work.settings)
-        check_places(work.place.period, *arguments)
-    for under in dict.fromkeys(jobs[index].environment for index in left):
-        make_environment(under.name, work.build_place(), under.conditions).close()
-    files.make_folder(work.folder)
-
-    def count(units: int) -> None:
-        nonlocal done
-        done += units
-        progress(done, total)
-
-    workers.run(work, left, count)
+    files.make_folder(work.store.folder)
     drives: dict[tuple[str, str, str], list[Drive]] = {}
     seconds: dict[tuple[str, str], list[float]] = {}
-    for job in jobs:
-        item = work.read(job)
-        if item is None:
-            raise InputError(f"{work.path(job)}: does not exist; it was removed")
-        label = job.environment.label
-        drives.setdefault((label, job.route.name, job.case), []).append(item[0])
-        seconds.setdefault((label, job.case), []).append(item[1])
+    found = run_drives(work, workers, progress)
+    for [spec], [item] in zip(work.groups, found, strict=True):
+        case = spec.case
+        drives.setdefault((spec.environment, spec.route, case), []).append(item.drive)
+        seconds.setdefault((spec.environment, case), []).append(item.wall_s)
     means = {key: sum(values) / len(values) for key, values in seconds.items()}
     return Evaluation(make_card(drives, limits), drives, means)
 
 
 def load_objects(
-    work: EvaluateWork,
+    work: EvaluateDrives,
 ) -> tuple[list[GridField], Surroundings | None]:
     """Load the objects of an evaluation and their surroundings, where it has any."""
     if work.cases == (NO_OBJECT,):
@@ -346,7 +287,7 @@ def load_objects(
     return site.load_objects(work.settings.most), site.load_surroundings()
 
 
-def _check_workers(work: EvaluateWork, workers: AbstractWorkers) -> None:
+def _check_workers(work: EvaluateDrives, workers: AbstractWorkers) -> None:
     named = CARLA in (under.name for under in work.environments)
     if named and not isinstance(workers, InThisProcess):
         raise InputError(
@@ -367,7 +308,7 @@ def check_policy(policy: AbstractPolicy, place: Place, routes: Sequence[Route]) 
         if given != taken and policy.control_scale == 1:
             raise InputError(
                 f"policy: gives {given}, the car of the place takes {taken}; evaluate "
-                "a policy of this car, or convert with --control-scale"
+                "a policy of this car, or set policy.control_scale"
             )
     shape = (1, place.camera.height, place.camera.width, 3)
     image = mi.TensorXf(np.zeros(shape, np.float32))

@@ -1,41 +1,173 @@
-"""Random looks of an attack's cost, the best of them, and what became of both."""
+"""Random looks of an attack's cost, and the best of them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mi_nerfattack.attack.base import AbstractAttack
 from mi_nerfattack.attack.black_box.random_looks import RandomLooks, equal_count, judge
-from mi_nerfattack.experiment.effort import Effort
-from mi_nerfattack.experiment.stages import Stages
-from mi_nerfattack.rollout.drive import BEST_RANDOM, RANDOM
-from mi_nerfattack.scenario.deployment import SURROGATE
-from mi_nerfattack.scenario.world import Appearance, World
+from mi_nerfattack.backend.determinism import deterministic, one_thread
+from mi_nerfattack.drives.run import OnSteps
+from mi_nerfattack.drives.spec import short_digest
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.run_folder import Effort
+from mi_nerfattack.io import files
+from mi_nerfattack.io.resumable import Record, Unit
+from mi_nerfattack.rollout.loop import OnStep
+from mi_nerfattack.scenario.scenario import Scenario
+from mi_nerfattack.scenario.world import (
+    Appearance,
+    World,
+    build_attack,
+    build_world,
+)
+from mi_nerfattack.system.workers import (
+    AbstractWork,
+    AbstractWorkers,
+    OnUnits,
+    raise_failure,
+    tally,
+)
+
+FORMAT = "mi_nerfattack judged look 1"
+
+
+@dataclass(frozen=True, eq=False)
+class RandomAppearances:
+    """Random textures, poses, or both: whatever the attack may change.
+
+    Attributes:
+        looks: draws.
+        own: the objects' own look; what an attack may not change stays like that.
+    """
+
+    looks: RandomLooks
+    own: Appearance
+
+    @classmethod
+    def of(cls, world: World, own: Appearance) -> RandomAppearances:
+        """Make the random looks of a scenario."""
+        scenario = world.scenario
+        freedom, kind = scenario.attack.freedom.build(), scenario.baseline.kind
+        return cls(RandomLooks(world.fields, freedom, kind, scenario.seed), own)
+
+    def __call__(self, number: int) -> Appearance:
+        """Return a look."""
+        textures, offsets = self.looks.textures(number), self.looks.offsets(number)
+        return Appearance(
+            self.own.textures if textures is None else textures,
+            self.own.offsets if offsets is None else offsets,
+        )
+
+
+class Judged(Record):
+    """What the judgement of a look gave.
+
+    Attributes:
+        objective: the attack's.
+        renders: frames that it took.
+    """
+
+    objective: float
+    renders: int
+
+
+class Judge:
+    """What a process needs to judge looks.
+
+    Each is judged as the attack judges its own, from the poses that it starts from:
+    by one drive, so that as many as :func:`equal_count` cost what the attack does.
+    """
+
+    def __init__(self, world: World, attack: AbstractAttack, own: Appearance) -> None:
+        self._world, self._attack = world, attack
+        self._looks = RandomAppearances.of(world, own)
+
+    def judge(self, number: int, on_step: OnStep) -> Judged:
+        """Judge a look."""
+        world, attack, before = self._world, self._attack, self._world.renders
+        world.show(self._looks(number))
+        with deterministic(world.scenario.attack.deterministic):
+            objective = judge(attack.rollout, attack.initial, on_step)
+        return Judged(objective=objective, renders=world.renders - before)
+
+
+@dataclass(frozen=True, eq=False)
+class Judgements(AbstractWork):
+    """Judgements of random looks, a file each.
+
+    Args:
+        folder: of the files.
+        identity: of the run.
+        scenario: of the run.
+        here: judges in this process; another process builds its own.
+    """
+
+    folder: Path
+    identity: Mapping[str, str]
+    scenario: Scenario
+    here: Judge | None
+
+    def open(self) -> Judge:
+        """Build world and attack, unless they are there."""
+        if self.here is not None:
+            return self.here
+        world = build_world(self.scenario, self.scenario.build_policy())
+        return Judge(world, build_attack(world), world.appearance())
+
+    def do(self, opened: Judge, index: int, report: OnUnits) -> None:
+        """Judge one look; a unit is a control period."""
+        with one_thread():
+            found = opened.judge(index, lambda step: report(1))
+        files.make_folder(self.folder)
+        self._unit(index).write({}, found)
+
+    def close(self, opened: Judge) -> None:
+        """Let go of nothing."""
+        del opened
+
+    def read(self, number: int) -> Judged | None:
+        """Read the judgement of a look; None where there is none."""
+        kept = self._unit(number).read()
+        return None if kept is None else kept.record
+
+    def remove_others(self, count: int) -> None:
+        """Remove what is left of other runs in the folder, and further looks."""
+        wanted = {self._unit(number).path for number in range(count)}
+        for path in self.folder.glob("*.safetensors"):
+            if path not in wanted:
+                path.unlink()
+
+    def _unit(self, number: int) -> Unit[Judged]:
+        identity = {"format": FORMAT, **self.identity, "look": f"{number}"}
+        name = f"look_{number:04d}-{short_digest(identity)}.safetensors"
+        return Unit(self.folder / name, identity, Judged, "remove the file")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the judge behind, whose world no process can send."""
+        return {**self.__dict__, "here": None}
 
 
 @dataclass
 class Baseline:
-    """Random textures, poses, or both: whatever the attack may change.
-
-    Each is judged as the attack judges its own, from the poses that it starts from:
-    by one drive, so that as many as :func:`baseline.equal_count` cost what it does.
+    """Random looks that cost together what an attack does, and what became of both.
 
     Attributes:
         attack: finished.
         looks: draws.
-        original: how the objects look and stand by themselves.
         count: of looks.
         deployed: of them, driven with in each deployment.
-        backward_multiple: cost of the attack's pass back, in drives.
+        backward_multiple: cost of the attack's backward pass, in drives.
         objectives: of the looks, once they are judged.
     """
 
     attack: AbstractAttack
-    looks: RandomLooks
-    original: Appearance
+    looks: RandomAppearances
     count: int
     deployed: int
     backward_multiple: float
@@ -55,36 +187,54 @@ class Baseline:
             world: what the scenario describes.
             original: how its objects look and stand by themselves.
             attack: finished.
-            effort: tells the cost of a pass back; in a deterministic run, where no
+            effort: tells the cost of a backward pass; in a deterministic run, where no
                 clock may decide anything, it counts as one drive, and of a search,
                 which makes none, as nothing.
         """
-        scenario = world.scenario
-        section, strict = scenario.baseline, scenario.attack.deterministic
+        section, strict = world.scenario.baseline, world.scenario.attack.deterministic
         is_timed = attack.sweeps > 1 and not strict
         multiple = effort.backward_multiple if is_timed else attack.sweeps - 1.0
         drives = attack.iteration * attack.rollout.frames / attack.rollout.horizon
         count = section.textures or equal_count(drives, multiple)
         deployed = min(count, section.deployment_textures)
-        draws = world.fields, attack.freedom, section.kind, scenario.seed
-        looks = RandomLooks(*draws)
-        return cls(attack, looks, original, count, deployed, multiple)
+        looks = RandomAppearances.of(world, original)
+        return cls(attack, looks, count, deployed, multiple)
 
-    def look(self, number: int) -> Appearance:
-        """Return a random look; what the attack may not change is the objects' own."""
-        return random_appearance(self.looks, number, self.original)
+    def judge(
+        self,
+        work: Judgements,
+        workers: AbstractWorkers,
+        progress: OnSteps,
+        on_judged: Callable[[int], None],
+    ) -> None:
+        """Judge all looks, and find the best.
 
-    def drive(self, stages: Stages) -> None:
-        """Judge and drive all looks in the surrogate, and find the best."""
-        attack = self.attack
-        found = stages.drive_random(
-            SURROGATE,
-            self.count,
-            self.look,
-            lambda on_step: judge(attack.rollout, attack.initial, on_step),
-        )
-        self.objectives = [value for value in found if value is not None]
-        stages.looks |= {RANDOM: self.look(0), BEST_RANDOM: self.look(self.best)}
+        Args:
+            work: their judgements.
+            workers: who does those that are missing.
+            progress: called with control periods done and wanted.
+            on_judged: called with the frames of each judgement.
+
+        Raises:
+            InputError: a file is damaged, or whatever a judgement raises.
+        """
+        horizon, numbers = self.attack.rollout.horizon, range(self.count)
+        left = [number for number in numbers if work.read(number) is None]
+        done = (self.count - len(left)) * horizon
+
+        def on_end(number: int, error: Exception | None) -> None:
+            raise_failure(number, error)
+            on_judged(self._read(work, number).renders)
+
+        count = tally(progress, done, self.count * horizon)
+        workers.run(work, left, count, on_end)
+        work.remove_others(self.count)
+        self.objectives = [self._read(work, number).objective for number in numbers]
+
+    def _read(self, work: Judgements, number: int) -> Judged:
+        if (found := work.read(number)) is None:
+            raise InputError(f"{work.folder}: look {number} is missing; it was removed")
+        return found
 
     @property
     def best(self) -> int:
@@ -99,20 +249,5 @@ class Baseline:
             "backward_multiple": self.backward_multiple,
             "best": self.best,
             "objectives": self.objectives,
-            "attack_objective": float(self.attack.best_objective),
+            "attack_objective": float(self.attack.judged_objective),
         }
-
-
-def random_appearance(looks: RandomLooks, number: int, own: Appearance) -> Appearance:
-    """Return a random look.
-
-    Args:
-        looks: draws.
-        number: of the look.
-        own: the objects' own; what an attack may not change stays like that.
-    """
-    textures, offsets = looks.textures(number), looks.offsets(number)
-    return Appearance(
-        own.textures if textures is None else textures,
-        own.offsets if offsets is None else offsets,
-    )

@@ -11,8 +11,10 @@ from mi_nerfattack.io import locks
 
 #: The scenario of a run, its paths absolute.
 SCENARIO = "scenario.toml"
-#: What it was doing, and the folder of its finished drives.
-CHECKPOINT, DRIVES = "checkpoint.safetensors", "drives"
+#: What it was doing, what it has cost, and the folders of finished drives and
+#: of judged random looks.
+CHECKPOINT, EFFORT = "checkpoint.safetensors", "effort.safetensors"
+DRIVES, LOOKS = "drives", "looks"
 
 
 @contextmanager
@@ -24,7 +26,7 @@ def claimed(folder: Path) -> Iterator[None]:
     """
     with locks.claimed(folder):
         present = {p.name for p in folder.iterdir() if not locks.is_partial(p)}
-        is_run = SCENARIO in present and present & {DRIVES, CHECKPOINT}
+        is_run = SCENARIO in present and present & {EFFORT, CHECKPOINT, DRIVES}
         if not (is_run or present <= {SCENARIO}):  # a run that was killed at once
             raise InputError(
                 f"{folder}: holds something else than a run; choose another folder"

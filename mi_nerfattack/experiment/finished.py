@@ -1,19 +1,31 @@
-"""What a run came to, before anything of it is written."""
+"""What a run came to: in memory, before anything is written, and in its folder."""
 
 from __future__ import annotations
 
+import base64
+import html
+import io
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
+from PIL import Image
 
 from mi_nerfattack.attack.base import AbstractAttack
+from mi_nerfattack.evaluation.metrics import drives_of_run
+from mi_nerfattack.experiment.run_folder import read_finished
+from mi_nerfattack.report.table import metrics_table
 from mi_nerfattack.rollout.drive import Drive, Lane
 from mi_nerfattack.scenario.world import Appearance, World
 
 #: Which frames of a drive become files: see :func:`pictures.frames.frame_steps`.
 Frames = Literal["all", "worst"] | int
+_WIDTH = 100  # characters of the table in a notebook
 
 
 @dataclass(frozen=True)
@@ -74,3 +86,63 @@ class Finished:
     def lane(self) -> Lane:
         """Of the route."""
         return Lane.of(self.world.route, self.world.scenario.vehicle.width_m)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished attack.
+
+    Args:
+        folder: the run folder, with pictures, drives and the attacked fields.
+
+    Raises:
+        InputError: the folder holds no finished run, or its ``metrics.json`` is
+            damaged.
+    """
+
+    folder: Path
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "folder", Path(self.folder))
+        _ = self.metrics
+
+    @cached_property
+    def metrics(self) -> dict[str, Any]:
+        """The content of ``metrics.json``."""
+        return read_finished(self.folder)
+
+    @cached_property
+    def drives(self) -> pd.DataFrame:
+        """A table with one row per drive, see `metrics.drives_of_run`."""
+        return drives_of_run(self.metrics)
+
+    @property
+    def frames(self) -> list[Path]:
+        """The files of all frames, by environment and case, in the order of time."""
+        return sorted((self.folder / "frames").glob("*/*.png"))
+
+    def plot(self) -> Image.Image:
+        """Draw the first drives from above; InputError if a file is missing."""
+        from mi_nerfattack.experiment.page.run import draw_above  # it loads plots
+
+        with tempfile.TemporaryDirectory() as name:
+            path = Path(name) / "overhead.png"
+            draw_above(path, [self.folder])
+            with Image.open(path) as image:
+                return image.convert("RGB")
+
+    def _repr_html_(self) -> str:
+        """Show the verdict, the table and the drives from above, in a notebook."""
+        from rich.console import Console
+
+        console = Console(record=True, file=io.StringIO(), width=_WIDTH, markup=False)
+        console.print(metrics_table(self.metrics))
+        layout = '<pre style="line-height: 1.2">{code}</pre>'
+        table = console.export_html(inline_styles=True, code_format=layout)
+        sentences = "".join(f"<p>{html.escape(s)}</p>" for s in self.metrics["verdict"])
+        overhead = self.folder / "overhead.png"  # missing where frames is None
+        image = ""
+        if overhead.is_file():
+            data = base64.b64encode(overhead.read_bytes()).decode()
+            image = f'<img width="600" src="data:image/png;base64,{data}">'
+        return f"<div>{sentences}{table}{image}</div>"

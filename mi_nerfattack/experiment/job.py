@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from contextlib import closing, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,32 +16,47 @@ from mi_nerfattack.backend import variant
 from mi_nerfattack.backend.determinism import deterministic, one_thread
 from mi_nerfattack.backend.interrupts import held_interrupts
 from mi_nerfattack.backend.versions import versions
+from mi_nerfattack.drives.spec import DriveSpec
 from mi_nerfattack.errors import InputError, RefusedError
-from mi_nerfattack.experiment.baseline import Baseline
+from mi_nerfattack.experiment.baseline import Baseline, Judge, Judgements
+from mi_nerfattack.experiment.cases import Cases, OnProgress, step_counter
 from mi_nerfattack.experiment.checks.before_attack import (
     first_findings,
     further_findings,
 )
-from mi_nerfattack.experiment.claim import claimed
-from mi_nerfattack.experiment.effort import Account, Effort
-from mi_nerfattack.experiment.finished import Finished, Frames
-from mi_nerfattack.experiment.kept_drives import SharedDrives
-from mi_nerfattack.experiment.run_folder import Run, RunFolder
-from mi_nerfattack.experiment.stages import OnProgress, Stages, step_counter
+from mi_nerfattack.experiment.claim import LOOKS, claimed
+from mi_nerfattack.experiment.finished import Finished, Frames, Run
+from mi_nerfattack.experiment.run_folder import Account, Effort, RunFolder
 from mi_nerfattack.rollout.drive import (
     ATTACK,
     BEST_RANDOM,
     NO_OBJECT,
     OWN,
+    RANDOM,
     departure_limit,
 )
-from mi_nerfattack.scenario.deployment import SURROGATE
-from mi_nerfattack.scenario.scenario import Scenario, load_scenario, portable_text
+from mi_nerfattack.scenario.deployment import SURROGATE, CarlaDeployment, labelled
+from mi_nerfattack.scenario.policy import HttpSection
+from mi_nerfattack.scenario.scenario import (
+    Scenario,
+    is_within,
+    load_scenario,
+    portable_text,
+)
 from mi_nerfattack.scenario.world import World, build_attack, build_world
 from mi_nerfattack.scenes import resolve
+from mi_nerfattack.system.workers import AbstractWorkers, InThisProcess, chosen_workers
 
 #: Called with a sentence.
 OnNotice = Callable[[str], None]
+
+
+#: Parts of a scenario that have no part in the judgement of a random look.
+_NOT_JUDGED = (
+    *("name", "deployment", "scene.deployment", "drive.runs", "baseline"),
+    *("attack.method", "attack.checkpoint_every"),
+)
+_JUDGED_BY = ("attack.method.kind", "attack.method.frame", "baseline.kind")
 
 
 def quiet(*arguments: Any) -> None:
@@ -70,7 +85,8 @@ class Job:
         started: `time.perf_counter()` from which the wall time counts.
         frames: of each case, see ``pictures.frames.frame_steps``; None writes no
             pictures at all: no frames, plots, attribution and page.
-        shared: drives that other runs have in common with this one, if any.
+        shared: folder of drives that other runs have in common with this one, if any.
+        workers: who does the drives.
     """
 
     scenario: Scenario
@@ -81,7 +97,8 @@ class Job:
     on_notice: OnNotice = quiet
     started: float = field(default_factory=time.perf_counter)
     frames: Frames | None = 3
-    shared: SharedDrives | None = None
+    shared: Path | None = None
+    workers: AbstractWorkers = field(default_factory=InThisProcess)
 
     def run(self, force: bool = False, anyway: bool = False) -> dict[str, Any]:
         """Claim the run folder and do the whole job; see :meth:`run_claimed`."""
@@ -96,7 +113,7 @@ class Job:
 
         Args:
             force: go on although scenario, files or versions have changed: the
-                attack goes on, the drives are repeated.
+                attack goes on; drives that are other ones now are repeated.
             anyway: go on with a scenario whose attack would prove nothing; what was
                 found stands under ``flags`` in the document.
 
@@ -109,12 +126,12 @@ class Job:
             RefusedError: the attack would prove nothing.
             SetupError: the scenario is deterministic and the variant cannot be.
         """
-        identity = {**versions(), **self.scenario.identity()}
+        described = self.scenario.identity()
+        identity = {**versions(), **described}
         text = portable_text(self.scenario, self.text)
-        route, seed = self.scenario.scene.route, self.scenario.seed
         strict = self.scenario.attack.deterministic
-        folder = RunFolder(self.output, text, identity, route, seed)
-        with deterministic() if strict else nullcontext():
+        folder = RunFolder(self.output, text, identity, self.shared)
+        with deterministic(strict):
             folder.read(force, self.on_notice)
             world = build_world(self.scenario, self.policy)
             departure_limit(world.route.lane_width_m, self.scenario.vehicle.width_m)
@@ -123,47 +140,46 @@ class Job:
             folder.begin()
             try:
                 account = Account(self.started, folder.effort)
-                return self._work(world, folder, account, anyway)
+                return self._work(world, folder, account, described, anyway)
             except InputError as err:
                 if not _is_of_disk(err):
                     folder.withdraw()
                 raise
 
     def _work(
-        self, world: World, folder: RunFolder, account: Account, anyway: bool
+        self,
+        world: World,
+        folder: RunFolder,
+        account: Account,
+        described: Mapping[str, str],
+        anyway: bool,
     ) -> dict[str, Any]:
         """Do what is not done yet."""
 
         def effort() -> Effort:
-            renders = world.renders + stages.renders
+            renders = world.renders + cases.renders
             return account.total(renders, folder.checkpoint.seconds)
 
-        kept, told = folder.drives, self.on_progress
-        stages = Stages(world, kept, told, effort, self.shared)
-        stages.looks[OWN] = original = world.appearance()
-        with closing(stages):
-            flags = self._check(world, folder, stages, anyway)
-            for case in (NO_OBJECT, OWN):
-                stages.drive_all(SURROGATE, case)
-            attack = self._attack(world, folder, account, effort)
-            stages.looks[ATTACK] = world.appearance()
-            baseline = Baseline.of(world, original, attack, effort())
-            baseline.drive(stages)
-            for case in (BEST_RANDOM, ATTACK):
-                stages.drive_all(SURROGATE, case)
-            for label in world.deployments:
-                for case in (NO_OBJECT, OWN):
-                    stages.drive_all(label, case)
-                stages.drive_random(label, baseline.deployed, baseline.look)
-                for case in (BEST_RANDOM, ATTACK):
-                    stages.drive_all(label, case)
+        def save() -> None:
+            folder.save(effort())
+
+        cases = Cases(world, folder.drives, described, self.on_progress, save)
+        with closing(cases):
+            flags = self._check(world, folder, cases, anyway)
+            attack = self._attack(world, folder, account, save)
+            cases.looks[ATTACK] = world.appearance()
+            baseline = Baseline.of(world, cases.own, attack, effort())
+            self._judge(baseline, folder, cases)
+            specs = list(self._specs(cases, baseline))
+            drives = cases.drive(specs, self.workers)
+        folder.drives.remove_others(specs)
         from mi_nerfattack.experiment import results  # it loads the plots
 
         done = Finished(
             world,
-            stages.drives,
+            drives,
             attack,
-            stages.looks,
+            cases.looks,
             folder.checkpoint.ignored,
             baseline.figures(),
             flags,
@@ -171,15 +187,42 @@ class Job:
         how = self.on_progress, self.on_notice, self.frames
         return results.write_results(self.output, done, effort, *how)
 
+    def _judge(self, baseline: Baseline, folder: RunFolder, cases: Cases) -> None:
+        """Judge random looks, and find the best."""
+        scenario, judge = self.scenario, Judge(cases.world, baseline.attack, cases.own)
+        decisive = {
+            key: value
+            for key, value in folder.identity.items()
+            if is_within(key, _JUDGED_BY) or not is_within(key, _NOT_JUDGED)
+        }
+        work = Judgements(folder.path / LOOKS, decisive, scenario, judge)
+
+        def progress(done: int, total: int) -> None:
+            self.on_progress("surrogate: random looks", done, total, "")
+
+        baseline.judge(work, self.workers, progress, cases.counter())
+        cases.looks[RANDOM] = baseline.looks(0)
+        cases.looks[BEST_RANDOM] = baseline.looks(baseline.best)
+
+    def _specs(self, cases: Cases, baseline: Baseline) -> Iterator[DriveSpec]:
+        """Describe all drives of the run."""
+        for label in cases.world.labels:
+            count = baseline.count if label == SURROGATE else baseline.deployed
+            for case in (NO_OBJECT, OWN):
+                yield from cases.of_case(label, case)
+            yield from cases.of_random(label, count)
+            for case in (BEST_RANDOM, ATTACK):
+                yield from cases.of_case(label, case)
+
     def _check(
-        self, world: World, folder: RunFolder, stages: Stages, anyway: bool
+        self, world: World, folder: RunFolder, cases: Cases, anyway: bool
     ) -> list[str]:
         """Return what makes the attack worthless, unless it was allowed before."""
         if folder.checkpoint.flags is not None:
             return folder.checkpoint.flags
         flags: list[str] = []
         for check in (first_findings, further_findings):
-            flags += check(world, stages.one)
+            flags += check(world, cases.one)
             if flags and not anyway:
                 listed = "\n".join(f"  {line}" for line in flags)
                 raise RefusedError(
@@ -196,7 +239,7 @@ class Job:
         world: World,
         folder: RunFolder,
         account: Account,
-        effort: Callable[[], Effort],
+        save: Callable[[], None],
     ) -> AbstractAttack:
         """Do the iterations that are missing; whatever stops them, keep those done."""
         attack = build_attack(world)
@@ -206,18 +249,21 @@ class Job:
         if not attack.best_is_judged:
             stage = "surrogate: best so far"
             attack.judge_best(step_counter(self.on_progress, stage, world.horizon))
-            checkpoint.save(attack, effort())
+            checkpoint.save(attack)
+            save()
         try:
             with held_interrupts() as check:
                 while not attack.is_over:
                     self._iterate(attack, account, check)
                     if attack.iteration % section.checkpoint_every == 0:
-                        checkpoint.save(attack, effort())
+                        checkpoint.save(attack)
+                        save()
                     check()
         finally:
             done = attack.iteration > checkpoint.iteration
             if done and attack.whole and not checkpoint.failed:
-                checkpoint.save(attack, effort())
+                checkpoint.save(attack)
+                save()
         attack.finish()
         return attack
 
@@ -246,6 +292,13 @@ class Job:
         attack.step(on_step)
         sweeps = np.diff(times)
         account.add_iteration(float(sweeps[::2].sum()), float(sweeps[1::2].sum()))
+        if len(attack.without_gradient) == len(attack.sensor.objects):
+            raise InputError(
+                f"attack iteration {attack.iteration}: the gradient is exactly 0, so "
+                "nothing would change; no object is in view, or the control has no "
+                "slope by the image (torch.round, a clamp at its limit): smooth it, or "
+                'give attack.method.kind = "blocks", which needs no gradient'
+            )
 
 
 def attack_policy(
@@ -255,6 +308,8 @@ def attack_policy(
     force: bool = False,
     anyway: bool = False,
     frames: Frames | None = 3,
+    workers: int = 1,
+    settings: Sequence[str] = (),
     progress: OnProgress = quiet,
     on_notice: OnNotice = quiet,
 ) -> Run:
@@ -267,6 +322,9 @@ def attack_policy(
         anyway: attack although the checks find that it would prove nothing.
         frames: of each case: ``"all"``, ``"worst"``, or so many, equally spaced; None
             writes no frames, plots, attribution and page.
+        workers: processes that drive. A script that takes more than 1 needs
+            ``if __name__ == "__main__":``, as with `multiprocessing`.
+        settings: keys that replace those of the file, such as ``"drive.runs=4"``.
         progress: called with stage, steps done, steps in all and a remark, for example
             `mi_nerfattack.progress()`.
         on_notice: called with a sentence, for example `print`.
@@ -277,17 +335,19 @@ def attack_policy(
     """
     started, output = time.perf_counter(), Path(folder)
     with claimed(output):
-        metrics = attack_claimed(
+        attack_claimed(
             resolve(str(scenario)),
             output,
             started=started,
             frames=frames,
+            workers=workers,
+            settings=settings,
             on_progress=progress,
             on_notice=on_notice,
             force=force,
             anyway=anyway,
         )
-    return Run(output, metrics)
+    return Run(output)
 
 
 def attack_claimed(
@@ -297,6 +357,8 @@ def attack_claimed(
     object_field: Path | None = None,
     started: float,
     frames: Frames | None,
+    workers: int | None,
+    settings: Sequence[str],
     on_progress: OnProgress,
     on_notice: OnNotice,
     force: bool,
@@ -310,6 +372,8 @@ def attack_claimed(
         object_field: grid field that replaces the one of every object.
         started: `time.perf_counter()` from which the wall time counts.
         frames: as of :func:`attack_policy`.
+        workers: likewise; None for one a core, 1 for what one server answers.
+        settings: as of :func:`attack_policy`.
         on_progress: called with stage, steps done, steps in all and a remark.
         on_notice: called with a sentence.
         force: as of :func:`attack_policy`.
@@ -318,10 +382,19 @@ def attack_claimed(
     Returns:
         the document that ``metrics.json`` holds.
     """
-    described, text = load_scenario(scenario, object_field)
+    described, text = load_scenario(scenario, object_field, settings)
     variant.ensure()
     policy = described.build_policy()
+    sections = [section for _, section in labelled(described.deployment)]
+    alone = isinstance(described.policy, HttpSection)
+    has_server = any(isinstance(section, CarlaDeployment) for section in sections)
+    if has_server and workers is not None and workers != 1:
+        raise InputError(
+            f"workers: {workers} for a deployment in CARLA, whose server one process "
+            "steps; give 1"
+        )
     with one_thread():
         reports = on_progress, on_notice
         job = Job(described, text, policy, folder, *reports, started, frames)
+        job.workers = chosen_workers(workers, alone or has_server)
         return job.run_claimed(force, anyway)

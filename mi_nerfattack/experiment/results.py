@@ -2,30 +2,73 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mi_nerfattack.evaluation.flags import run_flags
+import numpy as np
+
+from mi_nerfattack.attack.texture.statistics import seen_weights, texture_statistics
+from mi_nerfattack.drives.table import write_steps
 from mi_nerfattack.evaluation.metrics import metrics_document, validate
-from mi_nerfattack.evaluation.textures import texture_figures
-from mi_nerfattack.evaluation.verdict import verdict
-from mi_nerfattack.experiment.effort import Effort
+from mi_nerfattack.evaluation.verdict import run_flags, verdict
+from mi_nerfattack.experiment.attribution import control_changes, write_control_changes
+from mi_nerfattack.experiment.cases import OnProgress
 from mi_nerfattack.experiment.finished import Finished, Frames
 from mi_nerfattack.experiment.page.run import read_run
 from mi_nerfattack.experiment.pictures.write import write_images
-from mi_nerfattack.experiment.replayed import control_changes, write_control_changes
-from mi_nerfattack.experiment.run_folder import METRICS, object_path
-from mi_nerfattack.experiment.stages import OnProgress
+from mi_nerfattack.experiment.run_folder import METRICS, Effort, object_path
 from mi_nerfattack.fields import save_field
 from mi_nerfattack.io import files
-from mi_nerfattack.report.pages.parts import Parts
+from mi_nerfattack.report.pages.elements import Parts
 from mi_nerfattack.report.pages.results import write_results_page
-from mi_nerfattack.report.table import write_steps
-from mi_nerfattack.rollout.drive import ATTACK, OWN
+from mi_nerfattack.rollout.drive import ATTACK, OWN, Drive
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import Appearance, World
+from mi_nerfattack.vehicle.dynamics import to_state
+
+#: Frames of the first unattacked drive that say what of a texture is seen.
+FRAMES = 16
+
+
+def texture_figures(
+    world: World, drives: Sequence[Drive], own: Appearance, attacked: Appearance
+) -> dict[str, Any]:
+    """Judge the textures by what the camera of the unattacked drive sees of them.
+
+    Args:
+        world: what was driven in; its objects look attacked afterwards.
+        drives: the run's; the first of the case `own` in the surrogate is looked at.
+        own: how the objects look by themselves.
+        attacked: how the attack leaves them.
+
+    Returns:
+        ``textures`` by object, with the ``picture_share`` that it takes on average,
+        and ``saturated_share`` and ``total_variation``, means over the objects.
+    """
+    driven = next(d for d in drives if d.case == OWN and d.environment == SURROGATE)
+    picked = np.unique(np.linspace(0, len(driven.states) - 1, FRAMES).astype(int))
+    world.show(own)
+    states = [to_state(driven.states[None, step]) for step in picked]
+    weights = seen_weights(world.surrogate, world.fields, states)
+    world.show(attacked)
+    camera = world.surrogate.intrinsics
+    # A colour's sigmoid rises by a quarter there, in each channel of a pixel it fills.
+    filled = 3 / 4 * camera.width * camera.height * len(states)
+    found = {
+        item.id: asdict(texture_statistics(field, original, weight))
+        | {"picture_share": float(np.clip(weight.sum() / filled, 0, 1))}
+        for item, field, original, weight in zip(
+            world.scenario.objects, world.fields, own.textures, weights, strict=True
+        )
+    }
+    names = ("saturated_share", "total_variation")
+    means = {
+        name: float(np.mean([figures[name] for figures in found.values()]))
+        for name in names
+    }
+    return {"textures": found, **means}
 
 
 def write_results(
@@ -66,15 +109,14 @@ def write_results(
     except BaseException:
         on_notice(
             f"{path}: holds all figures; pictures are missing: make room if the disk "
-            "is full, and the same command writes them (fewer with --frames, none "
-            "with --no-pictures)"
+            "is full, and the same command writes them (fewer, or none, with "
+            "--pictures)"
         )
         raise
     return document
 
 
 def _write_tables(output: Path, done: Finished, history: list[dict[str, Any]]) -> None:
-    """Write steps, iterations and fields."""
     world, texture_of = done.world, done.look(ATTACK).textures
     write_steps(output / "steps.csv", done.driven, {world.route.name: done.lane})
     files.write_json(output / "attack.json", history)
@@ -103,8 +145,11 @@ def _describe(done: Finished, effort: Callable[[], Effort]) -> dict[str, Any]:
     if (curve := done.curve) is not None:
         more["curve"] = curve
     more["converged"] = done.attack.has_converged
-    if scenario.scene.bricks is not None:
-        more["bricks"] = _in_bricks(done)
+    bricks, one_level = scenario.scene.bricks, done.attack.one_level
+    if bricks is not None or one_level:
+        means = _optimised_and_exact(done)
+        more |= {"bricks": {"file": str(bricks), **means}} if bricks else {}
+        more |= {"one_level": means} if one_level else {}
     more |= texture_figures(world, done.drives, done.look(OWN), done.look(ATTACK))
     values, cost = scenario.model_dump(mode="json"), effort().model_dump()
     document = metrics_document(values, scenario.seed, done.driven, lanes, cost) | more
@@ -116,12 +161,11 @@ def _describe(done: Finished, effort: Callable[[], Effort]) -> dict[str, Any]:
     return document
 
 
-def _in_bricks(done: Finished) -> dict[str, Any]:
-    """Say how far the attack's own drives go in bricks, and in the field itself."""
+def _optimised_and_exact(done: Finished) -> dict[str, float]:
+    """Say how far the attack's own drives go as it made them, and in exact fields."""
     world, attack = done.world, done.attack
     world.show(done.look(ATTACK))
     return {
-        "file": str(world.scenario.scene.bricks),
         "cross_track_mean_m": attack.best_mean_m,
         "field_cross_track_mean_m": attack.measure_through(world.surrogate),
     }

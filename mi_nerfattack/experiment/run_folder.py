@@ -1,27 +1,229 @@
-"""The run folder of an attack: what a killed run left, and what this one keeps."""
+"""The run folder of an attack: what is kept between its processes, and their cost."""
 
 from __future__ import annotations
 
-import base64
-import html
-import io
 import os
+import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mi_nerfattack.attack.base import AbstractAttack
+from mi_nerfattack.backend.determinism import random_states, restore_random_states
+from mi_nerfattack.drives.store import Store
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.metrics import validate
-from mi_nerfattack.experiment.checkpoint import CheckpointFile
-from mi_nerfattack.experiment.claim import CHECKPOINT, DRIVES, SCENARIO
-from mi_nerfattack.experiment.effort import Effort
-from mi_nerfattack.experiment.kept_drives import KeptDrives
+from mi_nerfattack.experiment.claim import CHECKPOINT, DRIVES, EFFORT, SCENARIO
 from mi_nerfattack.io import files, locks
-from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM
+from mi_nerfattack.io.resumable import (
+    Kept,
+    Record,
+    Unit,
+    check_entries,
+    misfits_told,
+)
+from mi_nerfattack.system.machine import peak_memory_mb, peak_of_children_mb
 
+CHECKPOINT_FORMAT = "mi_nerfattack attack checkpoint 9"
+REMEDY = (
+    "go on with the scenario.toml of the run folder and the same files and versions, "
+    "start a new run folder, or ignore this (--force)"
+)
+
+
+class CheckpointRecord(Record):
+    """What is kept beside the state.
+
+    Differences that were ignored, findings of the checks before.
+    """
+
+    ignored: list[str]
+    flags: list[str] = []
+
+
+class CheckpointFile:
+    """The complete state of an attack on disk.
+
+    Textures, moments and history (:meth:`AbstractAttack.tensors`), the states of the
+    global random generators, the scenario with the hashes of its files, and versions.
+    Writing is not put off to another thread: only so is a finished iteration never
+    further from the disk than one checkpoint interval.
+
+    Args:
+        path: the file.
+        identity: versions and scenario, see :meth:`Scenario.identity`.
+
+    Attributes:
+        iteration: of the state on disk, as far as this process knows; 0 without.
+        seconds: that this process spent on writing.
+        failed: whether the last attempt to write failed.
+        ignored: differences that were ignored, over the file's life.
+        flags: findings of the checks before the attack; None as long as this scenario
+            was not checked.
+    """
+
+    def __init__(self, path: Path, identity: Mapping[str, str]) -> None:
+        self.path = path
+        identity = {"format": CHECKPOINT_FORMAT, **identity}
+        self._unit = Unit(path, identity, CheckpointRecord, REMEDY)
+        self.iteration = 0
+        self.seconds = 0.0
+        self.failed = False
+        self.ignored: list[str] = []
+        self.flags: list[str] | None = None
+        self._kept: Kept[CheckpointRecord] | None = None
+
+    def read(self, force: bool = False) -> None:
+        """Read and check the file, where there is one, for :meth:`restore`.
+
+        Args:
+            force: ignore what differs between the file and this run.
+
+        Raises:
+            InputError: the file is damaged, no checkpoint, or belongs to another
+                scenario or other versions.
+        """
+        self._kept = self._unit.read(force)
+        if self._kept is not None:
+            self.ignored = [*self._kept.record.ignored, *self._kept.ignored]
+            if not self._kept.ignored:
+                self.flags = self._kept.record.flags
+
+    @property
+    def found(self) -> bool:
+        """Whether :meth:`read` found a checkpoint."""
+        return self._kept is not None
+
+    def restore(self, attack: AbstractAttack) -> None:
+        """Give an attack the state that was read, which is forgotten here.
+
+        Where differences are ignored, the best parameters are still to be judged:
+        :meth:`AbstractAttack.judge_best`.
+
+        Raises:
+            InputError: an entry does not fit the objects.
+        """
+        kept, self._kept = self._kept, None
+        assert kept is not None, "read() has found a checkpoint"
+        needed = attack.tensors() | random_states()
+        if kept.ignored:  # of another scenario: without what this one adds
+            needed = {name: needed[name] for name in needed if name in kept.tensors}
+        check_entries(self.path, kept.tensors, needed)
+        with misfits_told(self.path):
+            if kept.ignored:
+                attack.go_on_from(kept.tensors)
+            else:
+                attack.load_tensors(kept.tensors)
+            restore_random_states(kept.tensors)
+        self.iteration = attack.iteration
+        if kept.ignored:
+            self.save(attack)
+
+    def save(self, attack: AbstractAttack) -> None:
+        """Write the complete state.
+
+        Args:
+            attack: between two iterations.
+
+        Raises:
+            InputError: the file cannot be written; the one before is intact.
+        """
+        start = time.perf_counter()
+        tensors = {**attack.tensors(), **random_states()}
+        self.failed = True
+        try:
+            record = CheckpointRecord(ignored=self.ignored, flags=self.flags or [])
+            self._unit.write(tensors, record)
+        except InputError as err:
+            raise InputError(f"{err}\n{self._advice(attack)}") from err
+        self.failed = False
+        self.iteration = attack.iteration
+        self.seconds += time.perf_counter() - start
+
+    def _advice(self, attack: AbstractAttack) -> str:
+        kept = (
+            f"the checkpoint of iteration {self.iteration} is intact"
+            if self.iteration
+            else "there is no checkpoint yet"
+        )
+        return (
+            f"iteration {attack.iteration} is not saved, {kept}; the same command "
+            "continues"
+        )
+
+
+class Effort(Record):
+    """Cost of a run.
+
+    Attributes:
+        wall_s: seconds; those between a killed process's last save and its end are
+            unknown.
+        peak_memory_mb: of the process that needed most.
+        renders: frames.
+        checkpoint_s: seconds spent on writing checkpoints.
+        processes: how many have worked on the run.
+        forward_s: seconds of the attack's drives; the first of each process, which
+            compiles, is left out.
+        backward_s: seconds of the passes back through them, likewise.
+    """
+
+    wall_s: float = 0.0
+    peak_memory_mb: float = 0.0
+    renders: int = 0
+    checkpoint_s: float = 0.0
+    processes: int = 0
+    forward_s: float = 0.0
+    backward_s: float = 0.0
+
+    @property
+    def backward_multiple(self) -> float:
+        """Cost of a pass back, in drives; 1 where none was measured."""
+        return self.backward_s / self.forward_s if self.forward_s else 1.0
+
+
+class Account:
+    """Adds what this process does to what earlier ones did.
+
+    Args:
+        started: `time.perf_counter()` at the start of this process's work.
+        before: effort of the earlier processes.
+    """
+
+    def __init__(self, started: float, before: Effort) -> None:
+        self._started, self._before = started, before
+        self._passes = [0.0, 0.0]
+        self._compiled = False
+
+    def add_iteration(self, forward_s: float, backward_s: float) -> None:
+        """Add the seconds of an iteration of the attack."""
+        if self._compiled:
+            self._passes[0] += forward_s
+            self._passes[1] += backward_s
+        self._compiled = True
+
+    def total(self, renders: int, checkpoint_s: float) -> Effort:
+        """Return the effort so far.
+
+        Args:
+            renders: frames of this process.
+            checkpoint_s: seconds of this process.
+        """
+        before = self._before
+        return Effort(
+            wall_s=before.wall_s + time.perf_counter() - self._started,
+            peak_memory_mb=max(
+                before.peak_memory_mb, peak_memory_mb(), peak_of_children_mb()
+            ),
+            renders=before.renders + renders,
+            checkpoint_s=before.checkpoint_s + checkpoint_s,
+            processes=before.processes + 1,
+            forward_s=before.forward_s + self._passes[0],
+            backward_s=before.backward_s + self._passes[1],
+        )
+
+
+FORMAT = "mi_nerfattack attack effort 1"
 METRICS = "metrics.json"
-_WIDTH = 100  # characters of the table in a notebook
 
 
 def object_path(folder: Path, name: str) -> Path:
@@ -46,46 +248,6 @@ def read_finished(folder: Path) -> dict[str, Any]:
     return document
 
 
-@dataclass(frozen=True)
-class Run:
-    """A finished attack.
-
-    Attributes:
-        folder: the run folder, with pictures, drives and the attacked fields.
-        metrics: the content of its ``metrics.json``.
-    """
-
-    folder: Path
-    metrics: dict[str, Any] = field(repr=False)
-
-    @classmethod
-    def read(cls, folder: str | Path) -> Run:
-        """Read a run folder.
-
-        Raises:
-            InputError: the folder holds no finished run, or the file is damaged.
-        """
-        return cls(Path(folder), read_finished(Path(folder)))
-
-    def _repr_html_(self) -> str:
-        """Show the verdict, the table and the drives from above, in a notebook."""
-        from rich.console import Console
-
-        from mi_nerfattack.report.table import metrics_table
-
-        console = Console(record=True, file=io.StringIO(), width=_WIDTH, markup=False)
-        console.print(metrics_table(self.metrics))
-        layout = '<pre style="line-height: 1.2">{code}</pre>'
-        table = console.export_html(inline_styles=True, code_format=layout)
-        sentences = "".join(f"<p>{html.escape(s)}</p>" for s in self.metrics["verdict"])
-        overhead = self.folder / "overhead.png"  # missing where frames is None
-        image = ""
-        if overhead.is_file():
-            data = base64.b64encode(overhead.read_bytes()).decode()
-            image = f'<img width="600" src="data:image/png;base64,{data}">'
-        return f"<div>{sentences}{table}{image}</div>"
-
-
 def folder_labels(folders: Sequence[Path]) -> list[str]:
     """Tell folders apart by as little of their paths as does it."""
     paths = [os.path.abspath(folder) for folder in folders]
@@ -99,27 +261,31 @@ def folder_labels(folders: Sequence[Path]) -> list[str]:
 class RunFolder:
     """A folder that this process has claimed, see :func:`claim.claimed`.
 
-    Its files appear in this order: ``scenario.toml``, ``drives/`` with a file a drive
-    and, among them, ``checkpoint.safetensors``, results. A process may be killed
-    between any two of them.
+    Its files appear in this order: ``scenario.toml``, ``effort.safetensors``, which
+    tells whose folder it is, ``drives/`` with a file a drive and, among them,
+    ``checkpoint.safetensors``, results. A process may be killed between any two.
 
     Args:
         path: the folder.
         text: the scenario file, its paths absolute.
         identity: versions and scenario, see :meth:`Scenario.identity`.
-        route: name of the route.
-        seed: of the scenario.
+        shared: folder of drives that other runs have in common with this one, if any.
     """
 
     def __init__(
-        self, path: Path, text: str, identity: Mapping[str, str], route: str, seed: int
+        self,
+        path: Path,
+        text: str,
+        identity: Mapping[str, str],
+        shared: Path | None = None,
     ) -> None:
         self.path = path
-        self._text = text
+        self.identity, self._text = identity, text
         self.checkpoint = CheckpointFile(path / CHECKPOINT, identity)
-        self.drives = KeptDrives(path / DRIVES, identity, route, seed)
+        self.drives = Store(path / DRIVES, shared)
         self.effort = Effort()
-        self._begun = False
+        own = {"format": FORMAT, **identity}
+        self._effort = Unit(path / EFFORT, own, Effort, REMEDY)
 
     def read(self, force: bool, on_notice: Callable[[str], None]) -> None:
         """Take up what a run left; nothing is written.
@@ -129,52 +295,51 @@ class RunFolder:
 
         Args:
             force: ignore that the run was of another scenario or other versions: its
-                attack goes on, its drives are repeated.
+                attack goes on; drives that are other ones now are repeated.
             on_notice: told about what is taken up and ignored.
 
         Raises:
             InputError: a file is damaged, or the run was of another scenario or other
                 versions.
         """
-        if not self._holds_run(force, on_notice):
-            return
-        of_attack = self.checkpoint.read(force)
-        of_drives, ignored = self.drives.read(force)
-        self.effort = max(of_attack, of_drives, key=lambda effort: effort.wall_s)
-        if not self.checkpoint.found:
-            for case in (BEST_RANDOM, ATTACK):  # they depend on it
-                self.drives.drop(case)
-        for line in dict.fromkeys([*self.checkpoint.ignored, *ignored]):
+        is_new = not (self.checkpoint.path.exists() or self.drives.folder.exists())
+        self.checkpoint.read(force)
+        kept, ignored = self._effort.read(force), self.checkpoint.ignored
+        if kept is not None:
+            self.effort, ignored = kept.record, [*ignored, *kept.ignored]
+        elif is_new:
+            self._check_scenario(force, on_notice)
+        for line in dict.fromkeys(ignored):
             on_notice(f"{self.path}: ignored, as told: {line}")
 
     def begin(self) -> None:
         """Make the folder ready to work in."""
         locks.remove_partial(self.path)
-        self._begun = not (self.path / SCENARIO).exists()
         files.write_text(self.path / SCENARIO, self._text)
-        self.drives.remove_others()
+        self.save(self.effort)
+
+    def save(self, effort: Effort) -> None:
+        """Write down what the run has cost so far."""
+        self._effort.write({}, effort)
+
+    def _check_scenario(self, force: bool, on_notice: Callable[[str], None]) -> None:
+        """Refuse to replace a scenario of which nothing was done."""
+        path = self.path / SCENARIO
+        if path.exists() and files.read_text(path) != self._text:
+            what = f"{path}: is another scenario, and nothing was done of it"
+            if not force:
+                raise InputError(
+                    f"{what}; choose another folder, remove the file, or replace it "
+                    "(--force)"
+                )
+            on_notice(f"{what}; replaced, as told")
 
     def withdraw(self) -> None:
-        """Remove what this process began, unless an iteration of the attack is done.
+        """Remove what was begun, unless an iteration of the attack is done.
 
         To be called where a scenario is refused: corrected, it is another one.
         """
-        if self._begun and not self.checkpoint.path.exists():
+        if not self.checkpoint.path.exists():
             self.drives.remove()
+            self._effort.path.unlink()
             (self.path / SCENARIO).unlink()
-
-    def _holds_run(self, force: bool, on_notice: Callable[[str], None]) -> bool:
-        """Tell a run from nothing; InputError for another run that did nothing."""
-        scenario = self.path / SCENARIO
-        begun = scenario.exists()
-        done = self.checkpoint.path.exists() or self.drives.paths()
-        if begun and not done:
-            if files.read_text(scenario) != self._text:
-                what = f"{scenario}: is another scenario, and nothing was done of it"
-                if not force:
-                    raise InputError(
-                        f"{what}; choose another folder, remove the file, or replace "
-                        "it (--force)"
-                    )
-                on_notice(f"{what}; replaced, as told")
-        return begun

@@ -1,5 +1,6 @@
 from .base import AbstractField as AbstractField
 from .bricks import BrickField as BrickField
+from .compact_splats import load_splats as load_splats
 from .grid import GridField as GridField
 from .grid import GridLayout as GridLayout
 from .io import load_field as load_field
@@ -8,4 +9,3 @@ from .io import save_field as save_field
 from .ngp import NGPField as NGPField
 from .ngp import NGPLayout as NGPLayout
 from .occupancy import Occupancy as Occupancy
-from .splats import read_splats as read_splats

@@ -1,4 +1,4 @@
-"""The interface of a radiance field: bounds, occupancy and point evaluation."""
+"""The interface of a radiance field, and what fields of several kinds share."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_nerfattack.backend.arrays import upload
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.occupancy import Occupancy, Window
 
 
@@ -162,3 +164,121 @@ class AbstractField(ABC):
         lower = mi.Point3f(*[float(v) for v in self.lower])
         inverse = mi.Vector3f(*[1.0 / float(v) for v in self.upper - self.lower])
         return mi.Point3f((point - lower) * inverse)
+
+
+def check_sky(image: np.ndarray) -> None:
+    """Raise InputError unless an image is (height, width, 3), and there is some."""
+    if image.ndim != 3 or image.shape[2] != 3 or not image.size:
+        raise InputError(f"sky: shape {image.shape}; expected (height, width, 3)")
+
+
+def activate(raw: list[mi.Float]) -> mi.Color3f:
+    """Turn raw colours, 3 x (n,), into linear ones."""
+    return dr.srgb_to_linear(mi.Color3f(*[1 / (1 + dr.exp(-x)) for x in raw]))
+
+
+def sky_colour(
+    image: mi.Float, shape: tuple[int, int], direction: mi.Vector3f
+) -> mi.Color3f:
+    """Look up a latitude-longitude image of raw colours bilinearly.
+
+    Args:
+        image: (height width 3,), row by row from the zenith (+z).
+        shape: height and width.
+        direction: (3, n), unit vectors.
+
+    Returns:
+        (3, n), linear.
+    """
+    height, width = shape
+    u = dr.atan2(direction.y, direction.x) * (0.5 / dr.pi) * width
+    v = dr.safe_acos(direction.z) / dr.pi * height - 0.5
+    u0, v0 = dr.floor(u), dr.floor(v)
+    colour = mi.Color3f(0)
+    for du in (0, 1):
+        for dv in (0, 1):
+            weight = (u - u0 if du else 1 - u + u0) * (v - v0 if dv else 1 - v + v0)
+            column = mi.Int32(u0) + du
+            column = dr.select(column < 0, column + width, column)
+            column = dr.select(column >= width, column - width, column)
+            column = dr.clip(column, 0, width - 1)  # where it is NaN
+            row = dr.clip(mi.Int32(v0) + dv, 0, height - 1)
+            index = mi.UInt32(row * width + column)
+            colour += weight * dr.gather(mi.Color3f, image, index)
+    return activate([colour.x, colour.y, colour.z])
+
+
+def box_metadata(field: AbstractField, info: dict[str, str]) -> dict[str, str]:
+    """Return the header entries that every kind of field file shares."""
+    return {
+        "kind": field.kind,
+        "lower": " ".join(repr(float(v)) for v in field.lower),
+        "upper": " ".join(repr(float(v)) for v in field.upper),
+        "occupancy_shape": " ".join(str(n) for n in field.window.cells.shape),
+        "step_m": repr(field.step_m),
+        "cone": repr(field.cone),
+        "length_unit": info.get("fit.source_unit", "metre"),
+        "colour_space": "radiance = srgb_to_linear(sigmoid(raw)), linear Rec. 709",
+    }
+
+
+def flat_parameter(value: Any, shape: tuple[int, ...], name: str) -> mi.Float:
+    """Turn an array of a given shape (or its flat form) into a flat Dr.Jit array.
+
+    Memory of NumPy is copied.
+
+    Raises:
+        InputError: another shape, or a value that is not finite.
+    """
+    if value is None:
+        value = np.zeros(shape, np.float32)
+    found = tuple(value.shape)
+    if found not in (shape, (int(np.prod(shape)),)):
+        raise InputError(f"{name}: shape {found}; expected {shape}")
+    if isinstance(value, np.ndarray):
+        flat = upload(mi.Float, value)
+    else:
+        flat = mi.Float(value.array if dr.is_tensor_v(value) else value)
+    check_finite(name, flat, int(np.prod(shape[1:])))
+    return flat
+
+
+def check_finite(
+    name: str, flat: Any, channels: int = 1, place: str = "vertex"
+) -> None:
+    """Raise InputError if a parameter holds NaN or infinity.
+
+    Nothing is checked while a kernel or a frozen function is recorded, since there are
+    no values yet.
+
+    Args:
+        name: of the parameter.
+        flat: its values, vertex by vertex; may be attached.
+        channels: values per vertex.
+        place: what messages call a vertex.
+    """
+    if dr.flag(dr.JitFlag.SymbolicScope) or dr.flag(dr.JitFlag.FreezingScope):
+        return
+    values = dr.detach(flat)
+    dr.schedule(values)  # or what gives them is computed twice
+    if dr.all(dr.isfinite(values)):
+        return
+    bad = ~np.isfinite(values.numpy())
+    raise InputError(
+        f"{name}: {np.count_nonzero(bad)} of {bad.size} values are NaN or infinite, "
+        f"the first at {place} {bad.argmax() // channels}; lower the learning rate, "
+        "and look for the first gradient that is not finite"
+    )
+
+
+def check_box(lower: np.ndarray, upper: np.ndarray) -> None:
+    """Raise InputError unless two (3,) corners are finite and in order."""
+    good = lower.shape == upper.shape == (3,) and np.isfinite(lower).all()
+    if not (good and np.isfinite(upper).all() and (upper > lower).all()):
+        raise InputError(f"bounding box: {lower} to {upper}; expected lower < upper")
+
+
+def check_positive(name: str, value: float) -> None:
+    """Raise InputError unless a number is finite and above zero."""
+    if not 0 < value < np.inf:
+        raise InputError(f"{name}: {value}; must be positive and finite")

@@ -12,10 +12,15 @@ import numpy as np
 
 from mi_nerfattack.backend.arrays import upload
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields.base import AbstractField
-from mi_nerfattack.fields.grid import box_metadata, check_box, check_positive
+from mi_nerfattack.fields.base import (
+    AbstractField,
+    box_metadata,
+    check_box,
+    check_positive,
+    check_sky,
+    sky_colour,
+)
 from mi_nerfattack.fields.occupancy import Occupancy
-from mi_nerfattack.fields.sky import check_sky, sky_colour
 
 #: Subdivisions of a cell along each axis.
 FINEST = 8
@@ -52,7 +57,6 @@ class Codes:
     high: float
 
     def __post_init__(self) -> None:
-        """Check that the range is one."""
         if not -_LARGEST_LOG < self.low < self.high < _LARGEST_LOG:
             raise InputError(
                 f"log_density: {self.low:g} to {self.high:g}; must rise, within "

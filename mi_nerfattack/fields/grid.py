@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -10,9 +12,14 @@ import mitsuba as mi
 import numpy as np
 from drjit.hashgrid import HashGridEncoding
 
-from mi_nerfattack.backend.arrays import upload
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields.base import AbstractField
+from mi_nerfattack.fields.base import (
+    AbstractField,
+    box_metadata,
+    check_box,
+    check_positive,
+    flat_parameter,
+)
 from mi_nerfattack.fields.levels import (
     GridLevel,
     largest_sum,
@@ -21,6 +28,7 @@ from mi_nerfattack.fields.levels import (
     read_planes,
 )
 from mi_nerfattack.fields.occupancy import Occupancy
+from mi_nerfattack.fields.one_level import OneLevel
 from mi_nerfattack.fields.vertex_colours import VertexColours
 from mi_nerfattack.notebook import picture
 
@@ -133,6 +141,8 @@ class GridField(AbstractField):
         check_positive("step_m", self.step_m)
         check_positive("density_scale", self.density_scale)
         self.info: dict[str, str] = dict(info or {})
+        self._marched: OneLevel | None = None  # in place of all levels
+        self._kept: OneLevel | None = None  # from the last time
         self.occupy(occupancy or Occupancy.full())
         self.encoding: HashGridEncoding = HashGridEncoding(
             mi.Float,
@@ -156,8 +166,10 @@ class GridField(AbstractField):
 
     def occupy(self, occupancy: Occupancy) -> None:
         """See :meth:`AbstractField.occupy`."""
+        self.refuse_one_level("occupy")
         super().occupy(occupancy)
         self._bound: float | None = None
+        self._kept = None
 
     @property
     def texture(self) -> mi.TensorXf:
@@ -166,13 +178,43 @@ class GridField(AbstractField):
 
     @property
     def packed(self) -> mi.Float:
-        """Density and colours side by side, (4 n_vertices,): what kernels read."""
-        return self.encoding.data
+        """Density and colours side by side, what kernels read.
+
+        (4 n_vertices,); of one level, the sums of all (see `OneLevel`).
+        """
+        return self.encoding.data if self._marched is None else self._marched.table
 
     @packed.setter
     def packed(self, value: mi.Float) -> None:
-        self.encoding.data = value
+        if self._marched is None:
+            self.encoding.data = value
+        else:
+            self._marched.table = value
         self._relist()
+
+    @contextmanager
+    def one_level(self, level: GridLevel) -> Iterator[None]:
+        """Evaluate the field as one level in place of all; see `OneLevel`.
+
+        Meanwhile there are derivatives by the colours of one level, and by nothing else
+        of the field.
+
+        Args:
+            level: one of :meth:`levels`.
+        """
+        self.refuse_one_level("one_level")
+        if not self.window.cells.any():
+            raise InputError("one_level: no cell of the grid field is occupied")
+        if self._kept is None or self._kept.level != level:
+            finest = self.levels()[-1]
+            self._kept = OneLevel(finest, level, self.window.cells)
+        try:
+            self._marched = self._kept
+            self._pack()
+            yield
+        finally:
+            self._marched = None
+            self._pack()
 
     @property
     def colours(self) -> VertexColours:
@@ -181,8 +223,23 @@ class GridField(AbstractField):
             self._colours = VertexColours(self)
         return self._colours
 
+    def refuse_one_level(self, name: str) -> None:
+        """Raise InputError while the field is one level, which leaves this out."""
+        if self._marched is not None:
+            raise InputError(
+                f"{name}: while a grid field is marched as one level, only "
+                "Rollout.gradient differentiates it, by the colours of that level, and "
+                "nothing else of it may change; leave one_level out"
+            )
+
     def texture_gradient(self, packed_gradient: mi.Float) -> mi.TensorXf:
-        """Pick the colours' part, (n_vertices, 3), out of a gradient of `packed`."""
+        """Pick the colours' part, (n_vertices, 3), out of a gradient of `packed`.
+
+        Where the field is one level, it is NaN for the vertices of all other levels.
+        """
+        if self._marched is not None:
+            grad = self._marched.texture_gradient(packed_gradient, self.n_vertices)
+            return mi.TensorXf(grad, (self.n_vertices, 3))
         i = dr.arange(mi.UInt32, 3 * self.n_vertices)
         vertex = i // 3
         grad = dr.gather(mi.Float, packed_gradient, 4 * vertex + 1 + (i - 3 * vertex))
@@ -209,7 +266,40 @@ class GridField(AbstractField):
         return packed
 
     def _pack(self) -> None:
-        self.packed = self.pack(self._texture)
+        if self._marched is None:
+            self.encoding.data = self.pack(self._texture)
+        else:
+            self._marched.sum_up(self._texture, self.sums)
+        self._relist()
+
+    def sums(self, unit: mi.Point3f, texture: mi.Float) -> list[mi.Float]:
+        """Add all levels up at points, also while the field is one level.
+
+        Args:
+            unit: (3, n) in the unit cube.
+            texture: (3 n_vertices,) raw colours, in place of the field's.
+
+        Returns:
+            density, red, green and blue, raw, (n,) each.
+        """
+        before = self.encoding.data
+        self.encoding.data = self.pack(texture)
+        try:
+            found = [mi.Float(x) for x in self._sum_levels(unit, mi.Bool(True))]
+            dr.eval(found)
+        finally:
+            self.encoding.data = before
+        return found
+
+    def _sum_levels(self, unit: mi.Point3f, active: mi.Bool) -> list[Any]:
+        features = self.encoding(unit, active)
+        return [
+            sum(
+                (features[4 * level + c] for level in range(1, self.layout.levels)),
+                start=features[c],
+            )
+            for c in range(4)
+        ]
 
     def eval_everywhere(
         self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
@@ -217,14 +307,8 @@ class GridField(AbstractField):
         """See :meth:`AbstractField.eval_everywhere`."""
         # The encoding reads one vertex past the last cell at exactly 1.
         unit = dr.clip(self.unit(point), 0.0, 1.0 - 1e-6)
-        features = self.encoding(unit, active)
-        d, r, g, b = [
-            sum(
-                (features[4 * level + c] for level in range(1, self.layout.levels)),
-                start=features[c],
-            )
-            for c in range(4)
-        ]
+        evaluate = self._sum_levels if self._marched is None else self._marched.eval
+        d, r, g, b = evaluate(unit, active)
         density = self.density_scale * dr.exp(dr.minimum(d, 15.0))
         colour = mi.Color3f(*[1 / (1 + dr.exp(-x)) for x in (r, g, b)])
         return density & active, dr.srgb_to_linear(colour) & active
@@ -246,8 +330,9 @@ class GridField(AbstractField):
         return self._bound
 
     def arrays(self) -> list[Any]:
-        """Return `packed`, occupancy and window."""
-        return [self.packed, *self.occupancy.arrays, self.window.array]
+        """Return `packed`, the lattice of one level, occupancy and window."""
+        lattice = [] if self._marched is None else self._marched.lattice
+        return [self.packed, *lattice, *self.occupancy.arrays, self.window.array]
 
     @property
     def has_gradients(self) -> bool:
@@ -261,14 +346,17 @@ class GridField(AbstractField):
 
     def set_parameter(self, name: str, value: Any) -> None:
         """Replace ``texture``, ``colour`` (that of :attr:`colours`) or ``density``."""
+        if dr.grad_enabled(value):
+            self.refuse_one_level(name)
         if name == "colour":
             self._texture = self.colours.replace(value)
         elif name == "texture":
             self._texture = flat_parameter(value, (self.n_vertices, 3), name)
         elif name == "density":
+            self.refuse_one_level("density")
             value = flat_parameter(value, (self.n_vertices,), name)
             mi.set_property(self._density, value)
-            self._bound = None
+            self._bound = self._kept = None
         else:
             raise KeyError(
                 f"{name}: a grid field has 'texture', 'colour' and 'density'"
@@ -305,79 +393,3 @@ class GridField(AbstractField):
             **box_metadata(self, self.info),
             "density_scale": repr(self.density_scale),
         }
-
-
-def box_metadata(field: AbstractField, info: dict[str, str]) -> dict[str, str]:
-    """Return the header entries that every kind of field file shares."""
-    return {
-        "kind": field.kind,
-        "lower": " ".join(repr(float(v)) for v in field.lower),
-        "upper": " ".join(repr(float(v)) for v in field.upper),
-        "occupancy_shape": " ".join(str(n) for n in field.window.cells.shape),
-        "step_m": repr(field.step_m),
-        "cone": repr(field.cone),
-        "length_unit": info.get("fit.source_unit", "metre"),
-        "colour_space": "radiance = srgb_to_linear(sigmoid(raw)), linear Rec. 709",
-    }
-
-
-def flat_parameter(value: Any, shape: tuple[int, ...], name: str) -> mi.Float:
-    """Turn an array of a given shape (or its flat form) into a flat Dr.Jit array.
-
-    Memory of NumPy is copied.
-
-    Raises:
-        InputError: another shape, or a value that is not finite.
-    """
-    if value is None:
-        value = np.zeros(shape, np.float32)
-    found = tuple(value.shape)
-    if found not in (shape, (int(np.prod(shape)),)):
-        raise InputError(f"{name}: shape {found}; expected {shape}")
-    if isinstance(value, np.ndarray):
-        flat = upload(mi.Float, value)
-    else:
-        flat = mi.Float(value.array if dr.is_tensor_v(value) else value)
-    check_finite(name, flat, int(np.prod(shape[1:])))
-    return flat
-
-
-def check_finite(
-    name: str, flat: Any, channels: int = 1, place: str = "vertex"
-) -> None:
-    """Raise InputError if a parameter holds NaN or infinity.
-
-    Nothing is checked while a kernel or a frozen function is recorded, since there are
-    no values yet.
-
-    Args:
-        name: of the parameter.
-        flat: its values, vertex by vertex; may be attached.
-        channels: values per vertex.
-        place: what messages call a vertex.
-    """
-    if dr.flag(dr.JitFlag.SymbolicScope) or dr.flag(dr.JitFlag.FreezingScope):
-        return
-    values = dr.detach(flat)
-    dr.schedule(values)  # or what gives them is computed twice
-    if dr.all(dr.isfinite(values)):
-        return
-    bad = ~np.isfinite(values.numpy())
-    raise InputError(
-        f"{name}: {np.count_nonzero(bad)} of {bad.size} values are NaN or infinite, "
-        f"the first at {place} {bad.argmax() // channels}; lower the learning rate, "
-        "and look for the first gradient that is not finite"
-    )
-
-
-def check_box(lower: np.ndarray, upper: np.ndarray) -> None:
-    """Raise InputError unless two (3,) corners are finite and in order."""
-    good = lower.shape == upper.shape == (3,) and np.isfinite(lower).all()
-    if not (good and np.isfinite(upper).all() and (upper > lower).all()):
-        raise InputError(f"bounding box: {lower} to {upper}; expected lower < upper")
-
-
-def check_positive(name: str, value: float) -> None:
-    """Raise InputError unless a number is finite and above zero."""
-    if not 0 < value < np.inf:
-        raise InputError(f"{name}: {value}; must be positive and finite")

@@ -17,6 +17,7 @@ from mi_nerfattack.fields.levels import count_read
 from mi_nerfattack.fields.ngp import NGPField, NGPLayout
 from mi_nerfattack.fields.occupancy import Occupancy
 from mi_nerfattack.io import files
+from mi_nerfattack.io.positions import require_near
 
 T = TypeVar("T", int, float)
 
@@ -62,11 +63,13 @@ def load_field(path: str | Path) -> AnyField:
             f"{path}: header entry 'kind' is {kind!r}; allowed: {', '.join(kinds)}"
         )
     try:
-        return kinds[kind](tensors, metadata)
+        field = kinds[kind](tensors, metadata)
     except KeyError as err:
         raise InputError(f"{path}: entry {err} is missing from the file") from err
     except ValueError as err:
         raise InputError(f"{path}: {err}") from err
+    require_near(path, np.stack([field.lower, field.upper]))
+    return field
 
 
 def load_grid(path: str | Path) -> GridField:
@@ -75,6 +78,11 @@ def load_grid(path: str | Path) -> GridField:
     if not isinstance(field, GridField):
         raise InputError(f"{path}: is a {field.kind}; a grid_field is needed here")
     return field
+
+
+def holds_splats(path: Path) -> bool:
+    """Tell files of splats from those of grids, by their suffix."""
+    return path.suffix.lower() in (".ply", ".spz", ".splat")
 
 
 def _check_finite(path: str | Path, tensors: Mapping[str, np.ndarray]) -> None:

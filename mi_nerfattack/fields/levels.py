@@ -1,4 +1,4 @@
-"""Levels of a hash grid: where their vertices lie, which are read, the largest sum."""
+"""Levels of a hash grid: their vertices, colours of these, the largest sum."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 _ROUNDING = (
@@ -60,6 +61,39 @@ def lay_out_levels(
     return levels, start
 
 
+def colours_of(level: GridLevel, texture: mi.Float) -> mi.Float:
+    """Return the colours (3 n,) of a level's n vertices in a texture, evaluated."""
+    size = 3 * (level.vertices.stop - level.vertices.start)
+    index = 3 * level.vertices.start + dr.arange(mi.UInt32, size)
+    colours = dr.gather(mi.Float, texture, index)
+    dr.eval(colours)
+    return colours
+
+
+def without(level: GridLevel, texture: mi.Float) -> mi.Float:
+    """Return a texture (3 n_vertices,) with zeros for the vertices of a level."""
+    return dr.select(is_of(level, dr.width(texture)), 0, texture)
+
+
+def is_same_beside(level: GridLevel, texture: mi.Float, other: mi.Float) -> bool:
+    """Tell whether two textures differ in the colours of one level at most.
+
+    Args:
+        level: of a grid.
+        texture: (3 n_vertices,) raw colours.
+        other: of the same or another size.
+    """
+    size = dr.width(texture)
+    same_size = size == dr.width(other)
+    return same_size and bool(dr.all(is_of(level, size) | (texture == other)))
+
+
+def is_of(level: GridLevel, size: int) -> mi.Bool:
+    """Tell which entries of a texture are of a level."""
+    index = dr.arange(mi.UInt32, size)
+    return (index >= 3 * level.vertices.start) & (index < 3 * level.vertices.stop)
+
+
 def read_planes(level: GridLevel, cells: np.ndarray) -> Iterator[np.ndarray]:
     """Yield which vertices are read in any occupied cell, plane by plane.
 
@@ -74,7 +108,7 @@ def read_planes(level: GridLevel, cells: np.ndarray) -> Iterator[np.ndarray]:
     layers = cells.transpose(2, 1, 0)
     for first, stop in zip(*z, strict=True):
         layer = np.logical_or.reduce(layers[first:stop])
-        yield _any_of(_any_of(layer.T, *x).T, *y)
+        yield any_of(any_of(layer.T, *x).T, *y)
 
 
 def count_read(levels: Sequence[GridLevel], cells: np.ndarray) -> int:
@@ -91,9 +125,9 @@ def _readers(level: GridLevel, count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.searchsorted(high, vertex, "left"), np.searchsorted(low, vertex, "right")
 
 
-def _any_of(cells: np.ndarray, first: np.ndarray, stop: np.ndarray) -> np.ndarray:
-    """Tell whether any cell of a column is set, from rows (n,) to before rows (n,)."""
-    before = np.zeros((len(cells) + 1, cells.shape[1]), np.int32)
+def any_of(cells: np.ndarray, first: np.ndarray, stop: np.ndarray) -> np.ndarray:
+    """Tell whether any cell is set along axis 0, from rows (n,) to before rows (n,)."""
+    before = np.zeros((len(cells) + 1, *cells.shape[1:]), np.int32)
     np.cumsum(cells, 0, out=before[1:])
     return before[stop] > before[first]
 

@@ -14,17 +14,19 @@ from drjit.hashgrid import HashGridEncoding
 
 from mi_nerfattack.backend.arrays import upload
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields.base import AbstractField
-from mi_nerfattack.fields.grid import (
+from mi_nerfattack.fields.base import (
+    AbstractField,
+    activate,
     box_metadata,
     check_box,
     check_finite,
     check_positive,
+    check_sky,
     flat_parameter,
+    sky_colour,
 )
 from mi_nerfattack.fields.levels import lay_out_levels, level_growth
 from mi_nerfattack.fields.occupancy import Occupancy
-from mi_nerfattack.fields.sky import activate, check_sky, sky_colour
 
 GEOMETRY_FEATURES = 16
 SH_ORDER = 3

@@ -2,18 +2,23 @@
 
 The file is the one that Kerbl et al. 2023 write, and most trainers after them: an
 element ``vertex`` with ``x y z``, ``f_dc_0..2``, ``f_rest_*``, ``opacity``,
-``scale_0..2`` and ``rot_0..3``. Normals and other properties are skipped.
+``scale_0..2`` and ``rot_0..3``. The 3D filter of Mip-Splatting, ``filter_3D``, is
+applied. Normals, points' colours and labels are skipped. Other properties are refused:
+there, trainers with other shapes or activations write what decides the picture.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
+from mi_nerfattack.io.positions import require_near
 
 MAX_BYTES = 1 << 31
 MAX_HEADER_BYTES = 1 << 16
@@ -43,6 +48,8 @@ _CENTERS = ("x", "y", "z")
 _COLOURS = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _ROTATIONS = ("rot_0", "rot_1", "rot_2", "rot_3")
+_FILTER = "filter_3D"
+_SKIPPED = "nx ny nz red green blue alpha label id object_id segment confidence".split()
 _NEEDED = (*_CENTERS, *_COLOURS, "opacity", *_SCALES, *_ROTATIONS)
 
 
@@ -55,7 +62,7 @@ class Splats:
         centers: (n, 3), metres once posed.
         scales: (n, 3) standard deviations along the axes, metres once posed.
         quaternions: (n, 4) unit quaternions w, x, y, z; axes to the file's frame.
-        opacities: (n,) in (0, 1], at the centre.
+        opacities: (n,) in [0, 1], at the centre.
         harmonics: (n, k, 3) coefficients of real spherical harmonics of a direction
             of view in the file's frame, k = 1, 4, 9 or 16; their sum plus 0.5 is a
             colour in sRGB.
@@ -89,13 +96,31 @@ def read_splats(path: str | Path) -> Splats:
         InputError: the file is missing, truncated or no such PLY; a property is
             missing, not finite or out of range; the message names file and property.
     """
+    return _decode(path, _rows(path, _check_present))
+
+
+def read_points(path: str | Path) -> np.ndarray:
+    """Read the positions (n, 3) of a PLY file's vertices, float64, finite.
+
+    Raises:
+        InputError: as `read_splats`; of properties, ``x y z`` alone are needed.
+    """
+
+    def check(path: str | Path, present: list[str]) -> None:
+        if not {*_CENTERS} <= {*present}:
+            raise InputError(f"{path}: its vertices need x, y and z, not {present}")
+
+    return _columns(path, _rows(path, check), _CENTERS)
+
+
+def _rows(path: str | Path, check: Callable[[str | Path, list[str]], None]) -> Any:
+    """Return the vertices of a PLY file, whose property names `check` takes first."""
     raw = files.read_bytes(path, MAX_BYTES)
     encoding, count, dtype, start = _header(path, raw)
+    check(path, list(dtype.names or ()))
     if encoding == "ascii":
-        rows = _ascii_rows(path, raw[start:], count, dtype)
-    else:
-        rows = _binary_rows(path, raw, count, dtype, start)
-    return _decode(path, rows)
+        return _ascii_rows(path, raw[start:], count, dtype)
+    return _binary_rows(path, raw, count, dtype, start)
 
 
 def _header(path: str | Path, raw: bytes) -> tuple[str, int, np.dtype, int]:
@@ -105,8 +130,8 @@ def _header(path: str | Path, raw: bytes) -> tuple[str, int, np.dtype, int]:
     newline = head.find(b"\n", end)
     if not head.startswith(b"ply") or end < 0 or newline < 0:
         raise InputError(
-            f"{path}: no PLY header; give a .ply of 3D Gaussian splats (compressed "
-            "formats such as .splat, .spz or .ksplat must be exported as .ply)"
+            f"{path}: no PLY header; give a .ply of points or of 3D Gaussian splats "
+            "(.ksplat and other formats must be exported as .ply)"
         )
     text = head[:end].decode("latin-1")
     lines = [words for line in text.splitlines()[1:] if (words := line.split())]
@@ -130,8 +155,8 @@ def _vertex(path: str | Path, lines: list[list[str]]) -> tuple[int, np.dtype]:
         )
     first, last = elements[0], (elements[1:] or [len(lines)])[0]
     number = (lines[first][2:3] or ["missing"])[0]
-    if not (number.isdecimal() and len(number) <= 10 and int(number)):
-        raise InputError(f"{path}: element vertex: {number}; at least 1 is needed")
+    if not (number.isdecimal() and len(number) <= 10):
+        raise InputError(f"{path}: element vertex: {number}; needs their number")
     fields: list[tuple[str, str]] = []
     for words in lines[first + 1 : last]:
         if words[0] != "property":
@@ -145,7 +170,6 @@ def _vertex(path: str | Path, lines: list[list[str]]) -> tuple[int, np.dtype]:
     if len(set(present)) < len(present):
         twice = next(name for name in present if present.count(name) > 1)
         raise InputError(f"{path}: property {twice} is there twice")
-    _check_present(path, present)
     return int(number), np.dtype(fields)
 
 
@@ -158,6 +182,13 @@ def _check_present(path: str | Path, present: list[str]) -> None:
             + f"; 3D Gaussian splats need {', '.join(_NEEDED)}"
         )
     rest = [name for name in present if name.startswith("f_rest_")]
+    known = {*_NEEDED, *_SKIPPED, *rest, _FILTER}
+    if unknown := [name for name in present if name not in known]:
+        raise InputError(
+            f"{path}: property {', '.join(unknown[:9])} of 'vertex' is not known and "
+            "may change the picture; export plain 3D Gaussian splats, or remove it if "
+            "it does not"
+        )
     wanted = [f"f_rest_{i}" for i in range(len(rest))]
     if len(rest) not in REST_OF_DEGREE or set(rest) != set(wanted):
         raise InputError(
@@ -175,7 +206,7 @@ def _binary_rows(
             f"{path}: {len(raw) - start} bytes of data, {needed} for {count} vertices "
             "are needed: truncated; copy or export it again"
         )
-    return np.frombuffer(raw, dtype, count, start)
+    return np.frombuffer(raw, dtype, count, start) if count else np.empty(0, dtype)
 
 
 def _ascii_rows(
@@ -201,6 +232,8 @@ def _ascii_rows(
 
 def _decode(path: str | Path, rows: np.ndarray) -> Splats:
     """Turn the trained parameters into what they stand for."""
+    if not len(rows):
+        raise InputError(f"{path}: element vertex: 0; at least 1 is needed")
     rest = sum(name.startswith("f_rest_") for name in rows.dtype.names or ())
     per_channel = rest // 3
     harmonics = np.empty((len(rows), 1 + per_channel, 3), np.float32)
@@ -210,9 +243,41 @@ def _decode(path: str | Path, rows: np.ndarray) -> Splats:
         names = tuple(f"f_rest_{first + j}" for j in range(per_channel))
         if names:
             harmonics[:, 1:, channel] = _columns(path, rows, names)
-    logarithms = _columns(path, rows, _SCALES)
-    _check_scales(path, logarithms)
+    scales = _columns(path, rows, _SCALES)
+    opacities = 0.5 + 0.5 * np.tanh(0.5 * _columns(path, rows, ("opacity",))[:, 0])
+    if _FILTER in (rows.dtype.names or ()):
+        # Yu et al. 2024, "Mip-Splatting", equation 9
+        _check_scales(path, scales)
+        sizes = np.exp(scales)
+        wide = np.hypot(sizes, _columns(path, rows, (_FILTER,)))
+        opacities, scales = opacities * np.prod(sizes / wide, axis=1), np.log(wide)
+    centers = _columns(path, rows, _CENTERS)
     quaternions = _columns(path, rows, _ROTATIONS)
+    return make_splats(path, centers, scales, quaternions, opacities, harmonics)
+
+
+def make_splats(
+    path: str | Path,
+    centers: np.ndarray,
+    logarithms: np.ndarray,
+    quaternions: np.ndarray,
+    opacities: np.ndarray,
+    harmonics: np.ndarray,
+) -> Splats:
+    """Check what a file says of n splats.
+
+    Args:
+        path: for messages.
+        centers: (n, 3).
+        logarithms: (n, 3), natural, of the standard deviations.
+        quaternions: (n, 4), w, x, y, z, of any length.
+        opacities: (n,), within 0 and 1.
+        harmonics: (n, k, 3).
+
+    Raises:
+        InputError: a number is out of range; the message names splat and property.
+    """
+    _check_scales(path, logarithms)
     lengths = np.linalg.norm(quaternions, axis=1, keepdims=True)
     if not lengths.all():
         where = int(np.flatnonzero(lengths[:, 0] == 0)[0])
@@ -220,20 +285,23 @@ def _decode(path: str | Path, rows: np.ndarray) -> Splats:
             f"{path}: rot_0, rot_1, rot_2, rot_3 of vertex {where} are all 0; a "
             "rotation is a quaternion w, x, y, z"
         )
-    logits = _columns(path, rows, ("opacity",))[:, 0]
+    if not np.isfinite(centers).all():
+        raise InputError(f"{path}: a position is not finite; export it again")
+    require_near(path, centers)
     return Splats(
         str(path),
-        _columns(path, rows, _CENTERS).astype(np.float32),
+        centers.astype(np.float32),
         np.exp(logarithms).astype(np.float32),
         (quaternions / lengths).astype(np.float32),
-        (0.5 + 0.5 * np.tanh(0.5 * logits)).astype(np.float32),
-        harmonics,
+        opacities.astype(np.float32),
+        harmonics.astype(np.float32),
     )
 
 
 def _columns(path: str | Path, rows: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
     """Return properties as (n, len(names)), float64, finite also in float32."""
-    columns = np.stack([rows[name].astype(np.float64) for name in names], 1)
+    with np.errstate(invalid="ignore"):  # of signalling NaN, refused below
+        columns = np.stack([rows[name].astype(np.float64) for name in names], 1)
     bad = ~(np.abs(columns) < np.finfo(np.float32).max)  # also where it is NaN
     if bad.any():
         vertex, column = np.argwhere(bad)[0]

@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.levels import colours_of, is_same_beside, without
 
 if TYPE_CHECKING:
     from mi_nerfattack.fields.grid import GridField
@@ -48,28 +49,33 @@ class VertexColours:
         self._start: int = level.vertices.start
         index = dr.arange(mi.UInt32, level.resolution**3)
         row = index // level.resolution
-        place = mi.Vector3f(index % level.resolution, row % level.resolution, 0)
+        place = mi.Point3f(index % level.resolution, row % level.resolution, 0)
         place.z = row // level.resolution
-        extent = mi.Vector3f(*map(float, (field.upper - field.lower) / level.scale))
-        self._points = mi.Point3f(*map(float, field.lower)) + place * extent
+        self._places = dr.minimum(place / level.scale, 1 - 1e-6)  # in the unit cube
+        # Sums of the other levels' raw colours there, and of which texture
+        self._others, self._summed = mi.Float(0), mi.Float(0)
         self.value = mi.TensorXf()
         self.read()
 
     def read(self) -> None:
         """Take the colours from the field's texture, which has been replaced.
 
-        They are computed when somebody looks at them.
+        All levels are added up only if others than the finest have changed.
         """
         with dr.suspend_grad():
-            self._texture = mi.Float(dr.detach(self.field.texture.array))
-            linear = self.field.eval_everywhere(
-                self._points, mi.Vector3f(0, 0, 1), mi.Bool(True)
-            )[1]
-            colours = dr.clip(dr.linear_to_srgb(linear), _MARGIN, 1 - _MARGIN)
-            flat = dr.ravel(mi.Color3f(colours))
-            self._raw = _logit(flat)
-            shape = (dr.width(flat) // 3, 3)
-            mi.set_property(self.value, mi.TensorXf(dr.detach(flat), shape))
+            texture = mi.Float(dr.detach(self.field.texture.array))
+            finest = self.field.levels()[-1]
+            if not is_same_beside(finest, texture, self._summed):
+                rest = without(finest, texture)
+                self._others = mi.Color3f(*self.field.sums(self._places, rest)[1:])
+                self._others, self._summed = dr.ravel(self._others), texture
+            self._texture = texture
+            raw = self._others + colours_of(finest, texture)
+            colours = dr.clip(1 / (1 + dr.exp(-raw)), _MARGIN, 1 - _MARGIN)
+            self._raw = _logit(colours)
+            dr.eval(self._others, self._raw, colours)
+            shape = (dr.width(colours) // 3, 3)
+            mi.set_property(self.value, mi.TensorXf(colours, shape))
 
     def replace(self, value: Any) -> mi.Float:
         """Replace the colours.
@@ -124,6 +130,7 @@ class VertexColours:
 @contextmanager
 def tangents(field: GridField) -> Iterator[None]:
     """Give the packed array the tangents of ``colour`` and ``density``."""
+    field.refuse_one_level("forward mode")
     before, by_texture = field.packed, dr.zeros(mi.Float, 3 * field.n_vertices)
     colour = field.colours.value
     if dr.grad_enabled(colour):
@@ -161,6 +168,7 @@ def gradient(field: GridField, name: str) -> Any:
     """
     packed = dr.grad(field.packed)
     if name == "density":
+        field.refuse_one_level(name)
         return dr.gather(mi.Float, packed, 4 * dr.arange(mi.UInt32, field.n_vertices))
     by_texture = field.texture_gradient(packed)
     return by_texture if name == "texture" else field.colours.gradient(by_texture)

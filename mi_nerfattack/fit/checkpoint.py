@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from mi_nerfattack.backend.versions import versions
-from mi_nerfattack.fit.options import FitProgress
+from mi_nerfattack.fit.options import FitOptions, FitProgress
 from mi_nerfattack.fit.training import Training
 from mi_nerfattack.io import files
-from mi_nerfattack.io.resumable import Record, Unit, check_entries, misfits_told
+from mi_nerfattack.io.resumable import (
+    Record,
+    Unit,
+    array_digest,
+    check_entries,
+    json_digest,
+    misfits_told,
+)
 
-FORMAT = "mi_nerfattack fit checkpoint 3"
+FORMAT = "mi_nerfattack fit checkpoint 4"
 _REMEDY = (
     "go on with the same images, depth, options and versions, or start again, which "
     "replaces the file (--force)"
@@ -80,19 +85,23 @@ class FitCheckpoint:
 
 
 def _digest(training: Training) -> str:
-    """Hash what decides a fit: images, masks, poses, depth, options, field, box."""
-    digest = hashlib.sha256()
+    """Hash what decides a fit: images, masks, poses, depth, options, field, box.
+
+    How long it lasts is left out: a longer fit goes on from a shorter one.
+    """
+    usual = FitOptions()
+    options = replace(
+        training.options,
+        steps=usual.steps,
+        epochs=usual.epochs,
+        budget_minutes=usual.budget_minutes,
+        patience=usual.patience,
+    )
     images = training.images
-    for image in images.images:
-        digest.update(np.ascontiguousarray(image).data)
-    for mask in () if images.masks is None else images.masks:
-        digest.update(np.ascontiguousarray(mask).data)
-    digest.update(np.ascontiguousarray(images.camera_to_world).data)
-    if training.depth is not None:
-        for depth in training.depth:
-            digest.update(np.ascontiguousarray(depth).data)
-    digest.update(repr((images.camera, images.cameras, training.options)).encode())
+    arrays = [*images.images, *(images.masks if images.masks is not None else ())]
+    arrays += [images.camera_to_world]
+    arrays += [] if training.depth is None else list(training.depth)
     metadata = training.field.metadata()
     info = {key: metadata[key] for key in metadata if key not in training.field.info}
-    digest.update(repr((info, training.pixels)).encode())
-    return digest.hexdigest()[:16]
+    about = images.camera, images.cameras, options, info, training.pixels
+    return json_digest([array_digest(arrays), repr(about)])[:16]

@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.backend.differentiate import vjp
+from mi_nerfattack.backend.arrays import vjp
 from mi_nerfattack.fit.rays import RayBatch
 from mi_nerfattack.ranges import NonNegative, Positive, checked
 from mi_nerfattack.render.rays import March

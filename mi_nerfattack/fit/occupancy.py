@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -182,6 +184,8 @@ def _in_view(
     offset = points - pose[:3, 3].astype(np.float32)
     x, y, z = (offset @ pose[:3, :3].astype(np.float32)).T
     z = z + np.float32(back)
+    if camera.is_fisheye and math.isinf(camera.largest_slope):
+        return np.ones(len(points), bool)  # its pyramid is all of space
     left, right, top, bottom = _edges(camera)
     room = 1 + 2 * border
     near = z > -radius

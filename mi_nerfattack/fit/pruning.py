@@ -10,7 +10,7 @@ import numpy as np
 
 from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.fields.base import AbstractField
-from mi_nerfattack.render.camera.intrinsics import generate_rays, pose_arrays
+from mi_nerfattack.render.camera.lens import generate_rays, pose_arrays
 from mi_nerfattack.render.march import STOP
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import Rays

@@ -12,7 +12,8 @@ import numpy as np
 from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fit.cameras import CameraCorrections
-from mi_nerfattack.render.camera.intrinsics import Camera, Lens, lens_rays, pose_arrays
+from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.render.camera.lens import Lens, lens_rays, pose_arrays
 from mi_nerfattack.render.rays import meet_box
 
 _CHUNK = 1 << 22

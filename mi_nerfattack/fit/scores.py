@@ -1,8 +1,8 @@
-"""How well a field shows given images: PSNR, SSIM, hazy rays, and what it renders."""
+"""How well a field shows pictures: PSNR, SSIM, hazy rays, holes, and what it shows."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,7 +13,8 @@ import numpy as np
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy, srgb_to_linear_numpy
 from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.fields.base import AbstractField
-from mi_nerfattack.render.camera.intrinsics import Camera, generate_rays, pose_arrays
+from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.render.camera.lens import generate_rays, pose_arrays
 from mi_nerfattack.render.march import march
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import Rays
@@ -41,9 +42,30 @@ class Rendering:
     depth: np.ndarray
 
     @property
+    def solid_depth(self) -> np.ndarray:
+        """The depth where the field stops half of the light, else infinity."""
+        return np.where(self.opacity >= SOLID, self.depth, np.inf)
+
+    @property
     def hazy(self) -> float:
         """Share of rays whose opacity lies inside `HAZY`."""
         return float(np.mean((self.opacity > HAZY[0]) & (self.opacity < HAZY[1])))
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """One view as it should be and as a field shows it.
+
+    Attributes:
+        wanted: (height, width, 3), sRGB in [0, 1].
+        shown: by the field.
+        depth: (height, width), metres along the ray, infinite or NaN where there is
+            no surface; None if unknown.
+    """
+
+    wanted: np.ndarray
+    shown: Rendering
+    depth: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -51,22 +73,39 @@ class ViewScore:
     """Agreement of one view.
 
     Attributes:
-        index: of the image.
-        name: of the image.
+        name: of the image, or of the place that the view is from.
         psnr_db: of sRGB values in [0, 1], infinite for equal images.
         ssim: Wang et al. 2004, Gaussian window of 1.5 px, mean over channels.
         hazy: share of rays that are neither solid nor free; see `Rendering.hazy`.
         holes: see `FieldRenderer.holes`; NaN where no depth is known.
-        rendering: what the field shows; kept for the worst views alone.
+        index: of the image.
+        route, arc_m, lateral_m: name, arc length and offset to the left of the place.
+        ceiling_db: PSNR that the noise of a path-traced image alone would leave.
+        depth_median_m, depth_p90_m: quantiles of the difference of depths; infinite
+            where the field shows nothing, NaN where no rays are compared.
+        wrong: share of rays that the field stops (opacity of at least 0.5) and the
+            scene does not, or the other way round.
+        pictures: kept for the worst views alone.
     """
 
-    index: int
     name: str
     psnr_db: float
     ssim: float
     hazy: float = 0.0
     holes: float = float("nan")
-    rendering: Rendering | None = field(default=None, repr=False, compare=False)
+    index: int = 0
+    route: str = ""
+    arc_m: float = 0.0
+    lateral_m: float = 0.0
+    ceiling_db: float = float("inf")
+    depth_median_m: float = float("nan")
+    depth_p90_m: float = float("nan")
+    wrong: float = 0.0
+    pictures: Pictures | None = field(default=None, repr=False, compare=False)
+
+    def entry(self, names: str) -> dict[str, Any]:
+        """Return attributes by name; `names` has spaces between them."""
+        return {name: getattr(self, name) for name in names.split()}
 
 
 class FieldRenderer:
@@ -105,6 +144,37 @@ class FieldRenderer:
             result.opacity.numpy().reshape(size).copy(),
             depth.numpy().reshape(size).copy(),
         )
+
+    def score(
+        self,
+        name: str,
+        camera: Camera,
+        camera_to_world: np.ndarray,
+        wanted: np.ndarray,
+        *,
+        depth: np.ndarray | None = None,
+        mask: np.ndarray | None = None,
+    ) -> ViewScore:
+        """Render one view and compare it with a picture of the same view.
+
+        Args:
+            name: of the view.
+            camera: intrinsics.
+            camera_to_world: (4, 4), OpenCV axes, metres.
+            wanted: (height, width, 3), sRGB in [0, 1].
+            depth: of the picture; see `Pictures.depth`.
+            mask: (height, width), bool, the pixels that count; None for all.
+
+        Returns:
+            the score, with its pictures.
+        """
+        shown = self.render(camera, camera_to_world)
+        psnr, ssim = compare(shown.image, wanted, mask)
+        holes = float("nan")
+        if depth is not None:
+            holes = self.holes(shown, camera, camera_to_world, depth)
+        pictures = Pictures(wanted, shown, depth)
+        return ViewScore(name, psnr, ssim, shown.hazy, holes, pictures=pictures)
 
     def holes(
         self,
@@ -172,24 +242,40 @@ def evaluate(
     renderer = FieldRenderer(field, over_white=images.channels == 4)
     scores: list[ViewScore] = []
     for index in map(int, indices):
-        pose, camera = images.camera_to_world[index], images.camera_of(index)
-        rendering = renderer.render(camera, pose)
-        mask = None if images.masks is None else images.masks[index]
-        psnr, ssim = compare(rendering.image, reference(images, index), mask)
-        holes = float("nan")
-        if depth is not None:
-            holes = renderer.holes(rendering, camera, pose, depth[index])
-        name, hazy = images.names[index], rendering.hazy
-        scores.append(ViewScore(index, name, psnr, ssim, hazy, holes, rendering))
-        kept = {score.index for score in worst_views(scores, keep)}
-        scores = [s if s.index in kept else replace(s, rendering=None) for s in scores]
+        score = renderer.score(
+            images.names[index],
+            images.camera_of(index),
+            images.camera_to_world[index],
+            reference(images, index),
+            depth=None if depth is None else depth[index],
+            mask=None if images.masks is None else images.masks[index],
+        )
+        scores = keep_worst([*scores, replace(score, index=index)], keep)
     return scores
 
 
-def worst_views(scores: Iterable[ViewScore], count: int) -> list[ViewScore]:
-    """Return the views of least PSNR whose rendering is kept, worst first."""
-    kept = [score for score in scores if score.rendering is not None]
-    return sorted(kept, key=lambda score: score.psnr_db)[:count]
+def keep_worst(scores: Sequence[ViewScore], count: int) -> list[ViewScore]:
+    """Drop the pictures of all views but those of least PSNR."""
+    best = {id(score) for score in worst_views(scores)[count:]}
+    return [replace(s, pictures=None) if id(s) in best else s for s in scores]
+
+
+def worst_views(scores: Iterable[ViewScore]) -> list[ViewScore]:
+    """Return the views whose pictures are kept, worst first."""
+    kept = [score for score in scores if score.pictures is not None]
+    return sorted(kept, key=lambda score: score.psnr_db)
+
+
+def mean(scores: Iterable[ViewScore], name: str) -> float:
+    """Return the mean of a figure over the views that have it; NaN if none has it."""
+    values = np.array([getattr(score, name) for score in scores])
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if known.size else float("nan")
+
+
+def least(scores: Iterable[ViewScore], name: str) -> float:
+    """Return the least value of a figure over views."""
+    return float(min(getattr(score, name) for score in scores))
 
 
 def compare(

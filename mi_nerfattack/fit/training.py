@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.backend.adam import adam_tensors, load_adam
+from mi_nerfattack.backend.arrays import adam_tensors, load_adam
 from mi_nerfattack.capture.inputs import depth_rays
 from mi_nerfattack.capture.posed_images import PosedImages, held_out
 from mi_nerfattack.errors import InputError

@@ -19,6 +19,7 @@ import stat
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,7 @@ import numpy as np
 from PIL import Image
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.io.strict_json import parse_json
-from mi_nerfattack.io.strict_toml import parse_toml
+from mi_nerfattack.io.strict import parse_json, parse_toml
 
 MAX_TEXT_BYTES = 1 << 28
 MAX_TOML_BYTES = 1 << 21
@@ -35,7 +35,9 @@ MAX_IMAGE_BYTES = 1 << 28
 MAX_IMAGE_PIXELS = 1 << 27
 MAX_TENSOR_BYTES = 1 << 33
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")  # of what `read_image` reads
+HEIC_SUFFIXES = (".heic", ".heif")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", *HEIC_SUFFIXES)  # that are read
+_HEIC_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 _IMAGE_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
 TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.tmp")  # what a killed writer leaves
 _TENSOR_REMEDY = "only .safetensors files are read"
@@ -49,7 +51,7 @@ _REASONS = {
     errno.EROFS: "the file system is read-only; choose another folder",
     errno.ENOSPC: "no space left on the disk; free some or choose another folder",
     errno.EDQUOT: "disk quota exceeded; free some space or choose another folder",
-    errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
+    errno.ENAMETOOLONG: "the name is too long; check the path",
     errno.ELOOP: "too many symbolic links; check the path",
     errno.EEXIST: "exists and is not a folder; choose another name",
 }
@@ -78,22 +80,6 @@ def sha256(path: str | Path) -> str:
     return digest.hexdigest()
 
 
-def read_rows(path: str | Path, start: int, rows: np.ndarray, out: np.ndarray) -> None:
-    """Read rows of a file that holds rows of one size, one after the other.
-
-    Args:
-        path: a regular file.
-        start: bytes before its first row.
-        rows: (k,) numbers from 0.
-        out: (k, ...), in C order; filled.
-    """
-    with reported(path), open(path, "rb", buffering=0) as file:
-        for row, into in zip(rows.tolist(), out, strict=True):
-            file.seek(start + row * into.nbytes)
-            if file.readinto(into.reshape(-1).view(np.uint8).data) != into.nbytes:
-                raise InputError(f"{path}: ends before row {row}; copy it again")
-
-
 def read_text(path: str | Path, limit: int = MAX_TEXT_BYTES) -> str:
     """Read a UTF-8 text file of at most `limit` bytes, without a byte order mark."""
     raw = read_bytes(path, limit)
@@ -116,26 +102,42 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
 
 def read_image(path: str | Path) -> np.ndarray:
-    """Read a PNG, JPEG or WebP image; see `decode_image`."""
+    """Read a PNG, JPEG, WebP or HEIC image; see `decode_image`."""
     return decode_image(path, read_bytes(path, MAX_IMAGE_BYTES))
 
 
 def decode_image(path: str | Path, raw: bytes) -> np.ndarray:
-    """Decode the content of a PNG, JPEG or WebP file; `path` is for messages.
+    """Decode the content of a PNG, JPEG, WebP or HEIC file; `path` is for messages.
 
     The pixels come as they are stored: an EXIF orientation is not applied, since
-    calibrated poses refer to the stored grid. Grey and palette images become RGB.
+    calibrated poses refer to the stored grid. HEIC turns them by itself. Grey and
+    palette images become RGB.
 
     Returns:
         sRGB values, uint8, (height, width, 3), or (height, width, 4) with alpha.
+
+    Raises:
+        InputError: it is damaged, or HEIC and pillow-heif is not installed.
     """
-    with _decoding(path, raw, ("PNG", "JPEG", "WEBP")) as image:
+    with _decoding(path, raw, image_formats(path, raw)) as image:
         if image.mode not in ("1", "L", "P", "RGB", "LA", "PA", "RGBA"):
             raise InputError(
                 f"{path}: pixel type {image.mode}; use 8 bits a channel, grey or RGB"
             )
         mode = "RGBA" if image.has_transparency_data else "RGB"
         return np.array(image.convert(mode), dtype=np.uint8)
+
+
+def image_formats(path: str | Path, raw: bytes) -> tuple[str, ...]:
+    """Return the formats of Pillow for `decode_image`; it then knows HEIC, too."""
+    if raw[4:8] != b"ftyp" or raw[8:12] not in _HEIC_BRANDS:
+        return "PNG", "JPEG", "WEBP"
+    try:
+        import_module("pillow_heif").register_heif_opener()
+    except ImportError as err:
+        told = "a HEIC photograph needs pillow-heif (our extra 'formats'), or JPEG"
+        raise InputError(f"{path}: {told}") from err
+    return ("HEIF",)
 
 
 def read_image16(path: str | Path) -> np.ndarray:
@@ -161,6 +163,18 @@ def read_safetensors(
     Returns:
         The tensors by name, and the file's metadata.
     """
+    with open_safetensors(path) as file:
+        wanted = file.keys() if names is None else names
+        tensors = {name: file.get_tensor(name) for name in wanted}
+        return tensors, dict(file.metadata() or {})
+
+
+@contextmanager
+def open_safetensors(path: str | Path) -> Iterator[Any]:
+    """Open a safetensors file, to read tensors whole or in part, as `safe_open` does.
+
+    The file is checked as by `read_safetensors`, and mapped as long as it is open.
+    """
     import safetensors
 
     size = _check_file(path, MAX_TENSOR_BYTES)
@@ -169,27 +183,13 @@ def read_safetensors(
     _check_tensor_header(path, start, size)
     try:
         with safetensors.safe_open(str(path), framework="numpy") as file:
-            wanted = file.keys() if names is None else names
-            tensors = {name: file.get_tensor(name) for name in wanted}
-            return tensors, dict(file.metadata() or {})
+            yield file
     except safetensors.SafetensorError as err:
         raise InputError(
             f"{path}: damaged or truncated ({err}); write or copy it again"
         ) from err
     except (TypeError, AttributeError, OSError, ValueError) as err:
         raise InputError(f"{path}: {err}; use types and sizes NumPy has") from err
-
-
-def find_tensor(path: str | Path, name: str) -> tuple[int, str, tuple[int, ...]]:
-    """Return where a tensor of a safetensors file begins, its type and its shape."""
-    read_safetensors(path, ())  # checks the header
-    with reported(path), open(path, "rb") as file:
-        length = int.from_bytes(file.read(8), "little")
-        entry = json.loads(file.read(length)).get(name)
-    if entry is None:
-        raise InputError(f"{path}: has no tensor {name!r}")
-    start = 8 + length + entry["data_offsets"][0]
-    return start, entry["dtype"], tuple(entry["shape"])
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -8,9 +8,10 @@ nothing, and a checksum of the tensors.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,21 @@ import pydantic
 
 from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.io import files
+
+
+def array_digest(arrays: Iterable[np.ndarray]) -> str:
+    """Return the SHA-256 of types, shapes and values of arrays, in their order."""
+    found = hashlib.sha256()
+    for values in arrays:
+        found.update(f"{values.dtype} {values.shape}".encode())
+        found.update(np.ascontiguousarray(values).reshape(-1).data)
+    return found.hexdigest()
+
+
+def json_digest(value: Any) -> str:
+    """Return the SHA-256 of a value as JSON; the order of keys does not count."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
 
 _RECORD = "kept.record"
 _CHECKSUM = "kept.crc32"
@@ -227,6 +243,12 @@ def _difference(key: str, kept: str | None, present: Mapping[str, str]) -> str:
     if old["file"] == new["file"]:
         return f"{key}: the content of {old['file']} has changed"
     return f"{key}: {old['file']} -> {new['file']}, of other content"
+
+
+def content_of(value: str) -> str:
+    """Return the SHA-256 of a value that stands for a file; any other value itself."""
+    entry = _as_file(value)
+    return value if entry is None else entry["sha256"]
 
 
 def _as_file(value: str | None) -> dict[str, Any] | None:

@@ -2,12 +2,12 @@ from .base import AbstractPolicy as AbstractPolicy
 from .black_box import AbstractBlackBox as AbstractBlackBox
 from .black_box import CallablePolicy as CallablePolicy
 from .drjit_network import DrJitNetwork as DrJitNetwork
-from .exported.program import export_program as export_program
+from .exported import export_program as export_program
 from .goals import AbstractGoal as AbstractGoal
 from .goals import IntegerGoal as IntegerGoal
 from .goals import NoGoal as NoGoal
 from .goals import OneHotGoal as OneHotGoal
-from .http_policy import HttpPolicy as HttpPolicy
+from .http.policy import HttpPolicy as HttpPolicy
 from .pilotnet import PilotNet as PilotNet
 from .preprocess import Preprocess as Preprocess
 from .torch_policy import TorchPolicy as TorchPolicy

@@ -65,11 +65,14 @@ def steering(
     """Take the control (n,) out of a network's answer, and refuse NaN.
 
     Args:
-        values: (n,), (n, 1), or (n, k) where `output` is given.
+        values: (n,), (n, 1), or (n, k) where `output` is given; of one image also ()
+            and (k,).
         count: n.
         output: column of the control.
         name: of the policy, for messages.
     """
+    if count == 1 and values.ndim < 2:  # a network that drops axes of size 1
+        values = values.reshape(1, -1)
     shape = tuple(values.shape)
     if shape != (count,):
         column = 0 if output is None and shape == (count, 1) else output
@@ -115,8 +118,10 @@ def usual_shape(
 
     Returns:
         (n, channels, height, width) or (n, height, width, channels); None where it
-        takes none of them.
+        takes none of them, or the shape of `image` with other values.
     """
+    if _takes(module, torch.zeros_like(image), rest):
+        return None
     kernels = [p.shape[1] for p in module.parameters() if p.ndim == 4][:1]
     for width, height in USUAL_PX:
         for channels in kernels or (3, 1):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 
@@ -39,6 +40,7 @@ class IntegerGoal(AbstractGoal):
     """
 
     count: Count
+    kind: Literal["integer"] = "integer"
 
     def arguments(
         self, goals: torch.Tensor, like: torch.Tensor
@@ -58,6 +60,7 @@ class OneHotGoal(AbstractGoal):
     """
 
     count: Count
+    kind: Literal["one_hot"] = "one_hot"
 
     def arguments(
         self, goals: torch.Tensor, like: torch.Tensor
@@ -68,8 +71,11 @@ class OneHotGoal(AbstractGoal):
 
 
 @dataclass(frozen=True)
+@checked()
 class NoGoal(AbstractGoal):
     """Pass nothing: every route is driven by the image alone."""
+
+    kind: Literal["none"] = "none"
 
     def arguments(
         self, goals: torch.Tensor, like: torch.Tensor
@@ -95,7 +101,7 @@ def declared_goal(module: torch.nn.Module) -> AbstractGoal:
         raise InputError(
             f"{type(module).__name__}.goals: a {type(count).__name__}; an integer of "
             "at least 1, or say how the goal is passed: goal=NoGoal(), in a scenario "
-            'policy.goal = "none"'
+            'policy.goal.kind = "none"'
         )
     return IntegerGoal(count)
 

@@ -86,16 +86,18 @@ Filter = Callable[[int, int], torch.Tensor]
 
 def bilinear(size: int, target: int) -> torch.Tensor:
     """Weight the two nearest pixels of each target pixel's centre."""
-    unit = torch.eye(size, dtype=torch.float64)[None, None]
-    resized = torch.nn.functional.interpolate(unit, (target, size), mode="bilinear")
-    return resized[0, 0]
+    return _interpolated(size, target)
 
 
 def antialias(size: int, target: int) -> torch.Tensor:
     """Weight by a triangle, as wide as two target pixels where the image shrinks."""
+    return _interpolated(size, target, antialias=True)
+
+
+def _interpolated(size: int, target: int, antialias: bool = False) -> torch.Tensor:
     unit = torch.eye(size, dtype=torch.float64)[None, None]
     resized = torch.nn.functional.interpolate(
-        unit, (target, size), mode="bilinear", antialias=True
+        unit, (target, size), mode="bilinear", antialias=antialias
     )
     return resized[0, 0]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
@@ -10,17 +10,151 @@ import numpy as np
 import torch
 
 from mi_nerfattack.backend.torch_arrays import to_row, to_tensor, to_torch
-from mi_nerfattack.errors import InputError
+from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.policy.base import AbstractPolicy, Memory
 from mi_nerfattack.policy.checks import (
     check_hidden,
     check_images,
     expand_goals,
+    misfit,
     steering,
+    usual_shape,
 )
 from mi_nerfattack.policy.goals import AbstractGoal, declared_goal
-from mi_nerfattack.policy.module_call import call_module, check_repeatable
+from mi_nerfattack.policy.one_image import OneImage
+from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.preprocess import Preprocess
+
+#: Part of the largest value by which two evaluations of one image may differ.
+TOLERANCE = 1e-4
+#: Part of the largest value by which the control may depend on the size of the batch.
+MIXED = 1e-2
+
+
+def call_module(
+    module: torch.nn.Module, name: str, *arguments: torch.Tensor
+) -> tuple[torch.Tensor, ...]:
+    """Call a module with tensors of its own, and check what it returns.
+
+    The camera's image is a view of memory that the loop reads again, and has the
+    strides of (n, h, w, 3). A foreign network may write into its input, or view it
+    as the contiguous array of its training, so that it gets copies; `PilotNet` does
+    neither, and convolves the view as it is.
+
+    Args:
+        module: is called as ``module(*arguments)``.
+        name: for messages.
+        arguments: image, goal, and hidden states.
+
+    Returns:
+        The control and the hidden states.
+
+    Raises:
+        InputError: the module takes images of another shape, which is told, raises an
+            exception, or returns something else than tensors.
+    """
+    try:
+        if isinstance(module, PilotNet):
+            result = module(*arguments)
+        else:
+            result = module(*(a.clone(memory_format=_PLAIN) for a in arguments))
+    except (InputError, torch.OutOfMemoryError, MemoryError):
+        raise
+    except Exception as err:  # a user's module raises whatever it likes
+        if is_interrupt(err):
+            raise
+        shapes = [tuple(part.shape) for part in arguments]
+        wanted = usual_shape(module, arguments[0], arguments[1:])
+        if wanted not in (None, shapes[0]):
+            raise InputError(f"{name}: {misfit(wanted, shapes[0])}") from err
+        raise InputError(
+            f"{name}: fails on an input of shape {shapes[0]}, with goal and hidden "
+            f"states {shapes[1:]}: {type(err).__name__}: {err}; declare "
+            "policy.preprocess, goal and recurrent as the network needs them"
+        ) from err
+    return _tensors(result, name)
+
+
+def check_repeatable(
+    module: torch.nn.Module, evaluate: Callable[[], torch.Tensor], name: str
+) -> None:
+    """Refuse a module that answers the same image twice differently.
+
+    The loop evaluates a control period anew for its derivative, and begins every
+    drive with the same module. Buffers that change betray what no answer shows yet.
+
+    Args:
+        module: the module; `PilotNet` is known to be repeatable.
+        evaluate: gives the control (n,).
+        name: for messages.
+
+    Raises:
+        InputError: the two controls differ, or a buffer has changed.
+    """
+    if isinstance(module, PilotNet):
+        return
+    with torch.no_grad():
+        before = {key: value.clone() for key, value in module.named_buffers()}
+        first, second = evaluate(), evaluate()
+        changed = [
+            key
+            for key, value in module.named_buffers()
+            if key in before and not torch.equal(before[key].to(value), value)
+        ]
+        difference = float((first - second).abs().max())
+        limit = TOLERANCE * float(torch.maximum(first.abs(), second.abs()).max())
+    if changed or difference > limit:
+        what = f"its buffer {changed[0]!r} changes" if changed else "its controls are"
+        values = "" if changed else f" {first.tolist()[:2]}, then {second.tolist()[:2]}"
+        raise InputError(
+            f"{name}: evaluated twice on one image, {what}{values}; it was exported in "
+            "training mode (dropout, batch statistics): export network.eval(); or it "
+            "keeps a state in itself: take and return it as a hidden state, "
+            "policy.recurrent"
+        )
+
+
+def check_alone(
+    evaluate: Callable[[int], torch.Tensor], name: str, least: float
+) -> None:
+    """Refuse a network whose control for one image depends on the rest of the batch.
+
+    Args:
+        evaluate: gives the controls (n,) of the first n of two images.
+        name: for messages.
+        least: difference that rounding explains.
+
+    Raises:
+        InputError: the first control differs.
+    """
+    try:
+        with torch.no_grad():
+            (alone,), both = evaluate(1).tolist(), evaluate(2).tolist()
+    except InputError:  # it takes batches of another size, and will tell of them
+        return
+    scale = max(abs(alone), abs(both[1]), abs(both[1] - both[0]))
+    if abs(both[0] - alone) > MIXED * scale + least:
+        raise InputError(
+            f"{name}: the control for one image is {alone:.6g} alone and "
+            f"{both[0]:.6g} in a batch with another image, so vehicles would influence "
+            "each other; batch statistics do that: export network.eval(), and give "
+            "normalisation layers running statistics"
+        )
+
+
+def _tensors(result: Any, name: str) -> tuple[torch.Tensor, ...]:
+    """Take a tensor, or a tuple or list of them, and nothing else."""
+    parts = tuple(result) if isinstance(result, (tuple, list)) else (result,)
+    wrong = [type(p).__name__ for p in parts if not isinstance(p, torch.Tensor)]
+    if wrong or not parts:
+        raise InputError(
+            f"{name}: returns {f'a {wrong[0]}' if wrong else 'an empty tuple'}; the "
+            "control as a tensor, or a tuple of it and the hidden states, is needed"
+        )
+    return parts
+
+
+_PLAIN = torch.contiguous_format
 
 
 class TorchPolicy(AbstractPolicy):
@@ -57,7 +191,6 @@ class TorchPolicy(AbstractPolicy):
         output: int | None = None,
         name: str | None = None,
     ) -> None:
-        """Take over `module`."""
         self.module = module.eval()
         for parameter in module.parameters():  # a ScriptModule has no requires_grad_
             parameter.requires_grad_(False)
@@ -145,20 +278,43 @@ class TorchPolicy(AbstractPolicy):
         return control, tuple(filled)
 
     def _check(self, image: Any, goal: Any, memory: Memory) -> None:
-        """Evaluate the very first image twice; a state in the module shows itself."""
+        """Evaluate the very first image twice, alone, and with a darker one.
+
+        A state in the module and batch statistics show themselves.
+        """
         if not self._checked:
             images = to_torch(image)
             check_repeatable(
                 self.module, lambda: self._evaluate(images, goal, memory)[0], self.name
             )
+            if not isinstance(self.module, PilotNet | OneImage):
+                goals = expand_goals(goal, images)[:1]
+                pair = torch.cat([images[:1], 0.25 * images[:1]])
+                parts = [
+                    (part.narrow(axis, 0, 1), axis)
+                    for part, axis in zip(memory, self._axes(), strict=True)
+                ]
+
+                def evaluate(count: int) -> torch.Tensor:
+                    hidden = (torch.cat([part] * count, axis) for part, axis in parts)
+                    several = goals.expand(count)
+                    return self._evaluate(pair[:count], several, tuple(hidden))[0]
+
+                check_alone(evaluate, self.name, 1e-6 * abs(self.control_scale))
             self._checked = True
+
+    def _axes(self) -> list[int]:
+        """Return the axis of the vehicles in each part of the memory."""
+        stack = [0] if self.preprocess.history else []
+        return [*stack, *(shape.index(-1) for shape in self.recurrent)]
 
     def _evaluate(
         self, image: torch.Tensor, goal: Any, memory: Memory
     ) -> tuple[torch.Tensor, Memory]:
         """Apply the module to (n, height, width, 3), in the module's precision."""
         check_images(image)
-        self.module.to(image.device)
+        if any(part.device != image.device for part in self._tensors()):
+            self.module.to(image.device)
         image = image.to(self._precision() or image.dtype)
         memory = tuple(part.to(image) for part in memory)
         planes = self.preprocess.transform(image)
@@ -196,5 +352,10 @@ class TorchPolicy(AbstractPolicy):
 
     def _precision(self) -> torch.dtype | None:
         """Return the type of the module's parameters and buffers, if it has any."""
-        tensors = (*self.module.parameters(), *self.module.buffers())
-        return next((t.dtype for t in tensors if t.is_floating_point()), None)
+        tensors = (t for t in self._tensors() if t.is_floating_point())
+        return next((t.dtype for t in tensors), None)
+
+    def _tensors(self) -> Iterator[torch.Tensor]:
+        """Yield the module's parameters and buffers."""
+        yield from self.module.parameters()
+        yield from self.module.buffers()

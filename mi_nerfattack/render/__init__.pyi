@@ -15,4 +15,4 @@ from .pathtrace.sequence import render_video as render_video
 from .posed import PosedField as PosedField
 from .rays import March as March
 from .rays import Rays as Rays
-from .splats import SplatBackground as SplatBackground
+from .splatting.background import SplatBackground as SplatBackground

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 
-from mi_nerfattack.backend.arrays import concat
 from mi_nerfattack.render.backdrop import AbstractBackdrop, Layer, fields_by_rays
 from mi_nerfattack.render.march import RayGradient, march, march_derivative
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.rays import March, Rays, pick_rays, shares_by_depth
+from mi_nerfattack.render.rays import March, Rays, Task, select, shares_by_depth
 from mi_nerfattack.render.scene_march import AbstractSceneMarch, scene_march
-
-FIRST_RAYS = 1 << 13  # that tasks wait for before a launch
 
 
 @dataclass
@@ -35,63 +31,6 @@ class Seen:
     def copy(self) -> Seen:
         """Return the same values with no derivatives attached."""
         return Seen(self.total.copy(), [layer.copy() for layer in self.layers])
-
-
-@dataclass
-class Task:
-    """A part of a backward pass.
-
-    Attributes:
-        rays: m of the rays, with the gains of the fields to march.
-        primal: what they gave.
-        cotangent: derivative of the objective by `primal`.
-        fields: indices of the fields to march.
-    """
-
-    rays: Rays = field(default_factory=Rays)
-    primal: March = field(default_factory=March)
-    cotangent: March = field(default_factory=March)
-    fields: tuple[int, ...] = ()
-
-    @property
-    def size(self) -> int:
-        """Number of rays."""
-        return dr.width(self.rays.direction)
-
-
-class TaskQueue:
-    """Tasks that wait until there are rays enough for a launch.
-
-    A launch goes over the whole buffer of gradients, however few its rays are.
-
-    Args:
-        run: does a task.
-    """
-
-    def __init__(self, run: Callable[[Task], None]) -> None:
-        self._run = run
-        self._waiting: dict[tuple[int, ...], list[Task]] = {}
-
-    def add(self, task: Task) -> None:
-        """Let a task wait, or do it with those that wait for the same fields."""
-        dr.eval(task)  # or it holds all rays of its image
-        waiting = self._waiting.setdefault(task.fields, [])
-        waiting.append(task)
-        if sum(one.size for one in waiting) >= FIRST_RAYS:
-            self._launch(task.fields)
-
-    def finish(self) -> None:
-        """Do all that wait."""
-        for which in list(self._waiting):
-            self._launch(which)
-
-    def clear(self) -> None:
-        """Forget all that wait."""
-        self._waiting.clear()
-
-    def _launch(self, which: tuple[int, ...]) -> None:
-        tasks = self._waiting.pop(which)
-        self._run(concat(tasks, [task.size for task in tasks]))
 
 
 class AbstractComposite(ABC):
@@ -248,9 +187,11 @@ class DepthComposite(AbstractComposite):
     def restore(
         self, posed: Sequence[Layer], rays: Rays, kept: Any, stop: float
     ) -> Seen:
-        """See :meth:`AbstractComposite.restore`; marches what comes after `kept`."""
-        others = [_see(item, rays, stop) for item in rays.light(posed)[len(kept) :]]
-        layers = [*kept, *others]
+        """See :meth:`AbstractComposite.restore`; marches the layers that are None."""
+        layers = [
+            _see(item, rays, stop) if layer is None else layer
+            for item, layer in zip(rays.light(posed), kept, strict=True)
+        ]
         return Seen(depth_composite(layers), layers) if layers else nothing(rays)
 
     def forward(
@@ -263,7 +204,7 @@ class DepthComposite(AbstractComposite):
         """See :meth:`AbstractComposite.forward`."""
         mode, none = dr.ADMode.Forward, March()
         tangents = [
-            march_derivative(mode, item, rays, layer, none, stop)[0]
+            _derive(mode, item, rays, layer, none, stop)[0]
             if item.has_gradients
             else none
             for item, layer in zip(rays.light(posed), seen.layers, strict=True)
@@ -296,7 +237,7 @@ class DepthComposite(AbstractComposite):
         """See :meth:`AbstractComposite.accumulate`."""
         (item,) = task.rays.light(posed)
         mode = dr.ADMode.Backward
-        march_derivative(mode, item, task.rays, task.primal, task.cotangent, stop)
+        _derive(mode, item, task.rays, task.primal, task.cotangent, stop)
 
     def backward_rays(
         self,
@@ -309,12 +250,12 @@ class DepthComposite(AbstractComposite):
     ) -> list[RayGradient]:
         """See :meth:`AbstractComposite.backward_rays`."""
         lit = rays.light(posed)
-        fields = fields_by_rays([lit[k] for k in wanted])
+        fields_by_rays([lit[k] for k in wanted])
         parts = self._cotangents(seen, cotangent)
         mode = dr.ADMode.Backward
         return [
-            march_derivative(mode, item, rays, seen.layers[k], parts[k], stop, True)[1]
-            for k, item in zip(wanted, fields, strict=True)
+            _derive(mode, lit[k], rays, seen.layers[k], parts[k], stop, True)[1]
+            for k in wanted
         ]
 
     def _cotangents(self, seen: Seen, cotangent: Seen) -> list[March]:
@@ -340,20 +281,12 @@ def _see(item: Layer, rays: Rays, stop: float) -> March:
     return march(item, rays, stop)
 
 
-def select(
-    wanted: mi.Bool, rays: Rays, primal: March, cotangent: March, which: tuple[int, ...]
-) -> list[Task]:
-    """Return the task of marching the wanted rays again; none without such rays.
-
-    Rays without a cotangent are not among them.
-    """
-    index = dr.compress(wanted & cotangent.differs())
-    if not dr.width(index):
-        return []
-
-    gains = [rays.gains[k] for k in which] if rays.gains else []
-    parts = replace(rays, gains=gains), primal, cotangent
-    return [Task(*(pick_rays(x, index) for x in parts), fields=which)]
+def _derive(
+    mode: dr.ADMode, item: Layer, rays: Rays, *more: Any
+) -> tuple[March, RayGradient]:
+    if isinstance(item, AbstractBackdrop):
+        return item.derivative(mode, rays, *more)
+    return march_derivative(mode, item, rays, *more)
 
 
 def depth_composite(layers: list[March]) -> March:

@@ -20,9 +20,7 @@ from mi_nerfattack.render.composite import (
     AbstractComposite,
     DepthComposite,
     Seen,
-    Task,
     nothing,
-    select,
 )
 from mi_nerfattack.render.march import (
     RayGradient,
@@ -33,7 +31,7 @@ from mi_nerfattack.render.march import (
     replay,
 )
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.rays import March, Rays
+from mi_nerfattack.render.rays import March, Rays, Task, select
 from mi_nerfattack.render.walk import MergedWalk
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import drjit as dr
@@ -296,3 +296,14 @@ def move_all(objects: Sequence[PosedField], offsets: np.ndarray) -> None:
 
 def _numbers(transform: Any) -> np.ndarray:
     return np.array(dr.detach(transform.matrix), np.float64).reshape(4, 4)
+
+
+def object_footprints(objects: Iterable[PosedField]) -> list[np.ndarray]:
+    """Return the outlines of the objects' boxes on the ground, (4, 2) metres each."""
+    outlines = []
+    for posed in objects:
+        low, high = posed.field.lower, posed.field.upper
+        x, y = (low[0], high[0], high[0], low[0]), (low[1], low[1], high[1], high[1])
+        corners = np.stack([x, y, np.zeros(4)], axis=1)
+        outlines.append(posed.placed.apply(corners)[:, :2])
+    return outlines

@@ -1,16 +1,16 @@
-"""Rays, and what a march gives of them."""
+"""Rays, what a march gives of them, and parts of a backward pass that wait."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.backend.arrays import put
+from mi_nerfattack.backend.arrays import concat, put
 
 
 @dataclass
@@ -177,3 +177,79 @@ def shares_by_depth(layers: Sequence[March]) -> list[March]:
         parts = layer.radiance, layer.opacity, layer.moment
         found.append(March(*(passed * part for part in parts)))
     return found
+
+
+FIRST_RAYS = 1 << 13  # that tasks wait for before a launch
+
+
+@dataclass
+class Task:
+    """A part of a backward pass.
+
+    Attributes:
+        rays: m of the rays, with the gains of the fields to march.
+        primal: what they gave.
+        cotangent: derivative of the objective by `primal`.
+        fields: indices of the fields to march.
+    """
+
+    rays: Rays = field(default_factory=Rays)
+    primal: March = field(default_factory=March)
+    cotangent: March = field(default_factory=March)
+    fields: tuple[int, ...] = ()
+
+    @property
+    def size(self) -> int:
+        """Number of rays."""
+        return dr.width(self.rays.direction)
+
+
+class TaskQueue:
+    """Tasks that wait until there are rays enough for a launch.
+
+    A launch goes over the whole buffer of gradients, however few its rays are.
+
+    Args:
+        run: does a task.
+    """
+
+    def __init__(self, run: Callable[[Task], None]) -> None:
+        self._run = run
+        self._waiting: dict[tuple[int, ...], list[Task]] = {}
+
+    def add(self, task: Task) -> None:
+        """Let a task wait, or do it with those that wait for the same fields."""
+        dr.eval(task)  # or it holds all rays of its image
+        waiting = self._waiting.setdefault(task.fields, [])
+        waiting.append(task)
+        if sum(one.size for one in waiting) >= FIRST_RAYS:
+            self._launch(task.fields)
+
+    def finish(self) -> None:
+        """Do all that wait."""
+        for which in list(self._waiting):
+            self._launch(which)
+
+    def clear(self) -> None:
+        """Forget all that wait."""
+        self._waiting.clear()
+
+    def _launch(self, which: tuple[int, ...]) -> None:
+        tasks = self._waiting.pop(which)
+        self._run(concat(tasks, [task.size for task in tasks]))
+
+
+def select(
+    wanted: mi.Bool, rays: Rays, primal: March, cotangent: March, which: tuple[int, ...]
+) -> list[Task]:
+    """Return the task of marching the wanted rays again; none without such rays.
+
+    Rays without a cotangent are not among them.
+    """
+    index = dr.compress(wanted & cotangent.differs())
+    if not dr.width(index):
+        return []
+
+    gains = [rays.gains[k] for k in which] if rays.gains else []
+    parts = replace(rays, gains=gains), primal, cotangent
+    return [Task(*(pick_rays(x, index) for x in parts), fields=which)]

@@ -12,9 +12,9 @@ from PIL import Image
 
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.render.pathtrace.frames import Frame, to_srgb
-from mi_nerfattack.report.plots.around import Around, over_paper
 from mi_nerfattack.report.plots.charts import BLUE, GREEN, ORANGE, blank, png
-from mi_nerfattack.report.plots.drives import draw_lane
+from mi_nerfattack.report.plots.map import draw_lane, frame_map
+from mi_nerfattack.report.plots.strip import Around, over_paper
 from mi_nerfattack.rollout.drive import Drive
 from mi_nerfattack.rollout.loop import Trajectory
 from mi_nerfattack.vehicle.route.route import Route
@@ -41,11 +41,10 @@ def _route(route: Route) -> bytes:
     """Draw the lane from above, its start green and its end orange."""
     with blank(_SIZE_IN, _DPI) as figure:
         axis = figure.subplots()
-        draw_lane(axis, route.points, route.lane_width_m)
+        draw_lane(axis, route)
         for point, colour in ((route.points[0], GREEN), (route.points[-1], ORANGE)):
             axis.plot(*point, "o", color=colour, markersize=6)
-        _label_map(axis)
-        axis.set_title(f"{route.name}, {route.length:.0f} m", loc="left")
+        frame_map(axis, f"{route.name}, {route.length:.0f} m")
         return png(figure)
 
 
@@ -54,12 +53,12 @@ def _drive(drive: Drive) -> bytes:
     """Draw the path from above, and the cross-track error over time."""
     with blank(_SIZE_IN, _DPI) as figure:
         above, errors = figure.subplots(1, 2)
-        _draw_paths(above, [drive.states[:, :2]])
-        above.set_title(f"{drive.environment}, {drive.route}, {drive.case}", loc="left")
+        title = f"{drive.environment}, {drive.route}, {drive.case}"
+        _draw_paths(above, [drive.states[:, :2]], title)
         errors.plot(drive.time_s, drive.cross_track_m, color=BLUE)
         errors.axhline(0, color="#9a9a9a", linewidth=0.8)
         errors.set_xlabel("time (s)")
-        errors.set_title("cross-track error (m)", loc="left")
+        errors.set_title("cross-track error (m)")
         return png(figure)
 
 
@@ -68,13 +67,13 @@ def _trajectory(trajectory: Trajectory) -> bytes:
     """Draw the paths from above, and the controls over time."""
     with blank(_SIZE_IN, _DPI) as figure:
         above, controls = figure.subplots(1, 2)
-        _draw_paths(above, trajectory.states_numpy()[:, :, :2])
         vehicles = "vehicle" if trajectory.count == 1 else "vehicles"
-        above.set_title(f"{trajectory.count} {vehicles}", loc="left")
+        paths = trajectory.states_numpy()[:, :, :2]
+        _draw_paths(above, paths, f"{trajectory.count} {vehicles}")
         time_s = trajectory.dt * np.arange(trajectory.horizon)
         controls.plot(time_s, trajectory.controls_numpy().T, linewidth=1)
         controls.set_xlabel("time (s)")
-        controls.set_title("the policy's control", loc="left")
+        controls.set_title("the policy's control")
         return png(figure)
 
 
@@ -88,22 +87,15 @@ def _field(field: GridField) -> bytes:
 
 @draw.register
 def _frame(frame: Frame) -> bytes:
-    """Show the colour."""
     return _encoded(to_srgb("frame", frame))
 
 
-def _draw_paths(axis: Any, paths: Iterable[np.ndarray]) -> None:
+def _draw_paths(axis: Any, paths: Iterable[np.ndarray], title: str) -> None:
     """Draw positions (T + 1, 2) from above; a dot is where each path starts."""
     for path in paths:
         (line,) = axis.plot(*path.T, linewidth=1.4)
         axis.plot(*path[0], "o", color=line.get_color(), markersize=4)
-    _label_map(axis)
-
-
-def _label_map(axis: Any) -> None:
-    axis.set_aspect("equal", adjustable="datalim")
-    axis.set_xlabel("x (m)")
-    axis.set_ylabel("y (m)")
+    frame_map(axis, title)
 
 
 def _encoded(image: np.ndarray) -> bytes:

@@ -1,306 +1,292 @@
-"""Tables of a run: a CSV row per step, and the metrics for a terminal."""
+"""The tables of results, made of documents as they are in files.
+
+A run has ``metrics.json``, a sweep ``summary.json``, a transfer a whole
+``transfer.json``; a policy card is that of `metrics.card_figures`.
+"""
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import rich.box
-import rich.table
+from mi_nerfattack.evaluation.metrics import cells
+from mi_nerfattack.report.columns import Cell, Column, Table
 
-from mi_nerfattack.evaluation.metrics import lane_of
-from mi_nerfattack.io import files
-from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT, Drive, Lane
+if TYPE_CHECKING:
+    from mi_nerfattack.report.pages.elements import RunPart
 
-STEP_COLUMNS = (
-    "environment",
-    "route",
-    "case",
-    "run",
-    "seed",
-    "step",
-    "time_s",
-    "x_m",
-    "y_m",
-    "heading_rad",
-    "control",
-    "cross_track_m",
-    "departed",
+Document = Mapping[str, Any]
+_TITLE = "Distance from the lane centre"
+_MEAN = "Mean distance from the lane centre (m)"
+_ROUTE, _ENVIRONMENT = Column("route", "route"), Column("environment", "environment")
+_CASE = Column("case", lambda row: row["case"].replace("_", " "))
+_FIGURES = (
+    Column("mean (m)", "cross_track_mean_m", short="mean\n(m)"),
+    Column("max (m)", "cross_track_max_m", short="max\n(m)"),
 )
+_NO_OBJECT, _RANDOM, _ATTACK = (
+    Column(case.replace("_", " "), f"{case}.cross_track_mean_m")
+    for case in ("no_object", "random", "attack")
+)
+_ATTACK_CI95 = Column("95 % (m)", "attack.cross_track_mean_ci95_m", terminal=False)
+_DRIVES_OUT = ("attack.drives_departed", "attack.drives", "")
+_OUT = ("attack.attacks_out", "attacks", "attack.attacks_out_rate_ci95")
+_KEPT = ("transfer.kept", "transfer.of", "transfer.rate_ci95")
 
 
-def write_steps(
-    path: str | Path, drives: Iterable[Drive], lanes: Mapping[str, Lane]
-) -> None:
-    """Write a CSV file with a row per drive and step, atomically.
-
-    Row `step` t = 1..T holds the state reached at `time_s`, the control that led to
-    it and its signed cross-track error; `departed` is 1 beyond the limit, else 0.
-    Numbers are written so that they read back to the same float64.
-
-    Args:
-        path: the file.
-        drives: written in the given order.
-        lanes: of each route.
-    """
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(STEP_COLUMNS)
-    for drive in drives:
-        writer.writerows(_rows(drive, lane_of(drive.route, lanes).wheel_m))
-    files.write_text(path, buffer.getvalue())
-
-
-def _rows(drive: Drive, limit: float) -> Iterable[list[Any]]:
-    names = [drive.environment, drive.route, drive.case, drive.run, drive.seed]
-    columns = zip(
-        drive.time_s.tolist(),
-        drive.states[1:].tolist(),
-        drive.controls.tolist(),
-        drive.cross_track_m.tolist(),
-        drive.departed(limit).tolist(),
-        strict=True,
+def metrics_table(document: Document) -> Table:
+    """Return the figures of a run: a row for each route, environment and case."""
+    mean, largest = _FIGURES
+    figures = [
+        *(Column("runs", "n"), mean),
+        Column("95 % (m)", "cross_track_mean_ci95_m", terminal=False),
+        largest,
+        Column("wheel out (s)", "wheel_out_s", 2, short="wheel\nout (s)"),
+        Column("centre out (s)", "centre_out_s", 2, terminal=False),
+        Column("departed", "drives_departed", short="drives\nout", bad=True),
+    ]
+    caption = (
+        "Mean and maximum over all steps and runs. The interval of random looks is a "
+        "bootstrap over them; cases of one look have none, since their runs differ in "
+        "the start alone. Times are means over the runs; departed runs had a wheel out."
     )
-    for step, (time, state, control, error, departed) in enumerate(columns, start=1):
-        yield [*names, step, time, *state, control, error, int(departed)]
+    labels = [_ROUTE, _ENVIRONMENT, _CASE]
+    return Table(_TITLE, labels, figures, list(_cases(document)), caption=caption)
 
 
-def metrics_table(document: Mapping[str, Any]) -> rich.table.Table:
-    """Return the metrics as a table that fits a terminal of 80 columns.
-
-    Args:
-        document: as of `metrics.metrics_document`.
-
-    Returns:
-        A row per route, environment and case: `wheel out` is the time beyond the limit,
-        mean over the runs, `drives out` how many runs had such a time.
-    """
-    table = _distances()
-    table.add_column("route", overflow="fold", max_width=14)
-    for name in ("environment", "case"):
-        table.add_column(name, no_wrap=True)
-    for name in ("runs", "mean\n(m)", "max\n(m)", "wheel\nout (s)", "drives\nout"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for route, environments in document["routes"].items():
-        for environment, cases in environments.items():
-            labels = [route, environment]
-            for case, figures in cases.items():
-                table.add_row(*labels, case, *_cells(figures))
-                labels = ["", ""]
-            table.add_section()
-    return table
+def runs_table(document: Document) -> Table:
+    """Return every drive of a run: a row each."""
+    figures = [
+        *(Column("run", "run"), *_FIGURES),
+        Column("wheel out (s)", "wheel_out_s", 2, bad=True),
+        Column("centre out (s)", "centre_out_s", 2, bad=True),
+        Column("back at (s)", "returned_s", 1),
+    ]
+    rows = [case | run for case in _cases(document) for run in case["per_run"]]
+    return Table(_TITLE, [_ENVIRONMENT, _CASE], figures, rows)
 
 
-def card_table(card: Mapping[str, Any]) -> rich.table.Table:
-    """Return a policy card as a table that fits a terminal of 80 columns.
-
-    Args:
-        card: {ENVIRONMENT: {ROUTE: {CASE: figures}}}, see `metrics.card_figures`.
-
-    Returns:
-        A row per environment, route and case; `drives departed` left the lane.
-    """
-    table = _distances()
-    table.add_column("environment", overflow="fold", min_width=11, max_width=18)
-    table.add_column("route", overflow="fold", min_width=8, max_width=14)
-    table.add_column("case", no_wrap=True)
-    for name in ("runs", "mean\n(m)", "max\n(m)", "drives\ndeparted", "expert\n(m)"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for environment, routes in card.items():
-        labels = [environment]
-        for route, cases in routes.items():
-            labels.append(route)
-            for case, figures in cases.items():
-                table.add_row(*labels, case, *_card_cells(figures))
-                labels = ["", ""]
-            labels = [""]
-        table.add_section()
-    return table
+def headline_table(runs: Sequence[RunPart]) -> Table:
+    """Return runs beside each other: a row for each route and environment."""
+    figures = [
+        *(_NO_OBJECT, _RANDOM, Column("95 %", "random.cross_track_mean_ci95_m")),
+        *(_ATTACK, Column("times random", _times_random, 1)),
+        Column("wheel out (s)", "attack.wheel_out_s", 2),
+        Column("departed", ("attack.drives_departed", "attack.n", ""), bad=True),
+    ]
+    caption = (
+        "Mean distances from the lane centre (m); what the attack does as a multiple "
+        "of random looks; seconds with a wheel out past the attack, mean over its "
+        "drives, and how many of its drives have any."
+    )
+    rows = [
+        {"run": run.label, **row}
+        for run in runs
+        for row in cells(run.document["routes"], "route", "environment")
+    ]
+    labels = [Column("run", "run"), _ROUTE, _ENVIRONMENT]
+    return Table(_MEAN, labels, figures, rows, caption=caption)
 
 
-def transfer_table(document: Mapping[str, Any]) -> rich.table.Table:
-    """Return the summary of a transfer as a table that fits a terminal of 80 columns.
-
-    Args:
-        document: whole, of `transfer.figures.make_document`.
-
-    Returns:
-        A row per environment and condition: the mean error of each case over the
-        attacks; the attack's as a multiple of that in the surrogate; how many attacks
-        have a wheel out for a second, with Wilson's interval in per cent.
-    """
-    table = _distances("Mean distance from the lane centre (m)")
-    table.add_column("environment", overflow="fold", max_width=19)
-    for case in document["cases"]:
-        table.add_column(case.replace("_", "\n"), justify="right", no_wrap=True)
-    for name in ("to sur-\nrogate", "attacks\nout"):
-        table.add_column(name, justify="right", no_wrap=True)
-    last = ""
-    for column in document["columns"]:
-        if column["environment"] != last:
-            table.add_section()
-            last = column["environment"]
-            table.add_row(last)
-        condition = column["condition"].replace(",", ",\n ")
-        table.add_row(f" {condition}", *_transfer_cells(column))
-    return table
+def textures_table(document: Document) -> Table:
+    """Return what the attack changed: a row for each object."""
+    figures = [
+        *(Column("L2 (rms)", "l2"), Column("L∞", "linf")),
+        Column("saturated", lambda row: f"{100 * row['saturated_share']:.0f} %"),
+        Column("total variation", "total_variation"),
+    ]
+    caption = (
+        "Of the colours that the camera sees in the unattacked drive (sRGB in 0 to "
+        "1): distances from the original, the share of values within 0.02 of 0 or 1, "
+        "the mean difference of neighbouring vertices."
+    )
+    rows = list(cells(document["textures"], "object"))
+    return Table("", [Column("object", "object")], figures, rows, caption=caption)
 
 
-def quality_table(document: Mapping[str, Any], condition: str) -> rich.table.Table:
-    """Return how attacks transfer by the surrogate that they were made in.
-
-    Args:
-        document: whole, of `transfer.figures.make_document`.
-        condition: the one that is told of.
-
-    Returns:
-        A row per surrogate and environment: PSNR on held-out views and steps of the
-        fit, the attacks' mean error, and how many of those that succeed in their
-        surrogate do there, with Wilson's interval in per cent.
-    """
-    table = _distances(f"Surrogates ({condition})")
-    table.add_column("surrogate", overflow="fold", max_width=18)
-    for name in ("PSNR\n(dB)", "steps"):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("environment", overflow="fold", max_width=16)
-    for name in ("attack\n(m)", "transfer"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for surrogate in document["surrogates"]:
-        psnr, steps = surrogate["psnr_heldout_db"], surrogate["steps"]
-        quality = "" if psnr is None else f"{psnr:.1f}"
-        about = [Path(surrogate["file"]).stem, quality, f"{steps or ''}"]
-        for column in surrogate["columns"]:
-            if column["condition"] == condition:
-                attack, kept = column["cases"].get(ATTACK), column["transfer"]
-                mean = "" if attack is None else f"{attack['cross_track_mean_m']:.3f}"
-                share = (
-                    ""
-                    if kept is None
-                    else _share(kept["kept"], kept["of"], kept["rate_ci95"])
-                )
-                table.add_row(*about, column["environment"], mean, share)
-                about = ["", "", ""]
-        table.add_section()
-    return table
+def card_table(card: Document) -> Table:
+    """Return a policy card: a row for each environment, route and case."""
+    figures = [
+        *(Column("runs", "n"), *_FIGURES),
+        Column("departed", "drives_departed", short="drives\ndeparted"),
+        Column("expert (m)", "expert.cross_track_mean_m", short="expert\n(m)"),
+    ]
+    rows = list(cells(card, "environment", "route", "case"))
+    return Table(_TITLE, [_ENVIRONMENT, _ROUTE, _CASE], figures, rows)
 
 
-def retrain_table(document: Mapping[str, Any]) -> rich.table.Table:
-    """Return what retraining came to as a table that fits a terminal of 80 columns.
-
-    Args:
-        document: with `table`, of `retrain.compare.table_rows`.
-
-    Returns:
-        A row per group of attacks, environment and stage: mean errors without objects
-        and past attacks, their ratio, drives that left the lane past attacks, and how
-        many attacks have a wheel out for a second.
-    """
-    table = _distances("Before and after, mean distance from the lane centre (m)")
-    for name in ("attacks", "environment", "policy"):
-        table.add_column(name, overflow="fold", max_width=19)
-    for name in ("no\nobject", "attack", "ratio", "drives\ndeparted", "attacks\nout"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for row in document["table"]:
-        labels = [row["group"].replace("_", " "), row["environment"]]
-        for stage in ("before", "after"):
-            clean, attack = (row[stage][case] for case in (NO_OBJECT, ATTACK))
-            table.add_row(
-                *labels,
-                stage,
-                *(f"{case['cross_track_mean_m']:.3f}" for case in (clean, attack)),
-                f"{row['attack_to_clean'][stage]:.2f}",
-                f"{attack['drives_departed']}/{attack['drives']}",
-                f"{attack['attacks_out']}/{row['attacks']}",
+def transfer_table(document: Document) -> Table:
+    """Return a transfer over its attacks: a row for each environment and condition."""
+    figures = [
+        *(
+            Column(
+                case.replace("_", " "),
+                f"{case}.cross_track_mean_m",
+                short=case.replace("_", "\n"),
             )
-            labels = ["", ""]
-        table.add_section()
-    return table
-
-
-def sweep_table(document: Mapping[str, Any]) -> rich.table.Table:
-    """Return the summary of a sweep as a table that fits a terminal of 80 columns.
-
-    Args:
-        document: whole, of `sweep.summary.summarise`.
-
-    Returns:
-        A row per route (and of all, if there are several), method, budget, environment
-        and case: mean error over the attacks, each of which counts once, its standard
-        deviation and BCa interval; drives that left the lane; how many attacks have a
-        wheel out for a second, with Wilson's interval in per cent.
-    """
-    table = _distances("Mean distance from the lane centre (m)")
-    table.add_column("case", overflow="fold", max_width=22)
-    for name in ("mean", "± sd", "95 % interval", "drives\ndeparted", "attacks\nout"):
-        table.add_column(name, justify="right", no_wrap=True)
-    last, groups = "", document["groups"]
-    single = len({group["route"] for group in groups}) == 2  # it, and None
-    for group in groups:
-        if single and group["route"] is None:
-            continue
-        route = "all routes" if group["route"] is None else group["route"]
-        labels = route, group["method"], group["budget"], group["environment"]
-        title = " ".join(str(label) for label in labels if label is not None)
-        if title != last:
-            table.add_section()
-            last = title
-            table.add_row(title)
-        table.add_row(f" {group['case']}", *_sweep_cells(group))
-    return table
-
-
-def _sweep_cells(group: Mapping[str, Any]) -> list[str]:
-    spread, interval = group["cross_track_sd_m"], group["cross_track_mean_ci95_m"]
-    out = group["attacks_out"], group["attacks"], group["attacks_out_rate_ci95"]
-    return [
-        f"{group['cross_track_mean_m']:.3f}",
-        "" if spread is None else f"{spread:.3f}",
-        "" if interval is None else f"[{interval[0]:.3f}, {interval[1]:.3f}]",
-        f"{group['drives_departed']}/{group['drives']}",
-        _share(*out),
+            for case in document["cases"]
+        ),
+        _ATTACK_CI95,
+        Column("to surrogate", "ratio_to_surrogate", 2, short="to sur-\nrogate"),
+        Column("drives out", _DRIVES_OUT, terminal=False),
+        Column("attacks out", _OUT, short="attacks\nout"),
+        Column("transfer", _KEPT, terminal=False),
     ]
+    caption = (
+        "Over attacks, each of which counts once: mean error and its 95 % interval, "
+        "the mean error as a multiple of that in the surrogate (geometric mean), "
+        "attacks with a wheel out, and of those that succeed in the surrogate how many "
+        "do here, with Wilson's intervals."
+    )
+    rows = [column | column["cases"] for column in document["columns"]]
+    labels = [_ENVIRONMENT, Column("condition", "condition")]
+    return Table(_MEAN, labels, figures, rows, heading=1, caption=caption)
 
 
-def _transfer_cells(column: Mapping[str, Any]) -> list[str]:
-    cases, ratio = column["cases"], column["ratio_to_surrogate"]
-    means = [f"{figures['cross_track_mean_m']:.3f}" for figures in cases.values()]
-    attack, out = cases.get(ATTACK), ""
-    if attack is not None:
-        rate = attack["attacks_out_rate_ci95"]
-        out = _share(attack["attacks_out"], column["attacks"], rate)
-    return [*means, "" if ratio is None else f"{ratio:.2f}", out]
-
-
-def _share(count: int, total: int, interval: Sequence[float]) -> str:
-    low, high = (round(100 * end) for end in interval)
-    return f"{count}/{total} [{low}, {high}]"
-
-
-def _distances(title: str = "Distance from the lane centre") -> rich.table.Table:
-    box = rich.box.SIMPLE_HEAD
-    return rich.table.Table(title=title, box=box, pad_edge=False, padding=(0, 1))
-
-
-def _card_cells(figures: Mapping[str, Any]) -> list[str]:
-    """Return runs, mean, largest, drives that left the lane, the expert's mean."""
-    expert = figures.get("expert")
-    return [
-        str(figures["n"]),
-        f"{figures['cross_track_mean_m']:.3f}",
-        f"{figures['cross_track_max_m']:.3f}",
-        str(figures["drives_departed"]),
-        "" if expert is None else f"{expert['cross_track_mean_m']:.3f}",
+def quality_table(document: Document, condition: str) -> Table:
+    """Return how attacks transfer, under one condition, by surrogate."""
+    rows = [
+        {"surrogate": surrogate, **column, **column["cases"]}
+        for surrogate in document["surrogates"]
+        for column in surrogate["columns"]
+        if column["condition"] == condition
     ]
-
-
-def _cells(figures: Mapping[str, Any]) -> list[str]:
-    return [
-        str(figures["n"]),
-        f"{figures['cross_track_mean_m']:.3f}",
-        f"{figures['cross_track_max_m']:.3f}",
-        f"{figures['wheel_out_s']:.1f}",
-        str(figures["drives_departed"]),
+    labels = [
+        Column("surrogate", lambda row: Path(row["surrogate"]["file"]).stem),
+        Column("PSNR (dB)", "surrogate.psnr_heldout_db", 1),
+        *(Column("steps", "surrogate.steps"), _ENVIRONMENT),
     ]
+    figures = [_ATTACK, Column("transfer", _KEPT)]
+    return Table(f"Surrogates ({condition})", labels, figures, rows)
+
+
+def retrain_table(document: Document) -> Table:
+    """Return a retraining: a row for each group, environment and stage."""
+    rows = [
+        {**row, **row[stage], "stage": stage, "ratio": row["attack_to_clean"][stage]}
+        for row in document["table"]
+        for stage in ("before", "after")
+    ]
+    figures = [
+        *(_NO_OBJECT, _ATTACK, _ATTACK_CI95, Column("ratio", "ratio", 2)),
+        Column("drives out", _DRIVES_OUT, short="drives\ndeparted"),
+        Column("attacks out", _OUT, short="attacks\nout"),
+    ]
+    caption = (
+        f"Before and after fine-tuning on {len(document.get('runs', ()))} attacks, "
+        "from unseen starts. Mean distances from the lane centre (m), with 95 % "
+        "intervals over attacks; how many attacks have a wheel out for a second."
+    )
+    if document.get("adaptive"):
+        caption += (
+            " Adaptive: the policy before past the attacks found on it, the policy "
+            "after past attacks found on itself, in the same scenarios."
+        )
+    group = Column("attacks", lambda row: row["group"].replace("_", " "))
+    labels = [group, _ENVIRONMENT, Column("policy", "stage")]
+    title = "Before and after, mean distance from the lane centre (m)"
+    return Table(title, labels, figures, rows, caption=caption)
+
+
+def sweep_table(document: Document) -> Table:
+    """Return a sweep over its attacks: a row for each group and case."""
+    groups = document["groups"]
+    if len({group["route"] for group in groups}) == 2:  # one route, and None
+        groups = [group for group in groups if group["route"] is not None]
+    left, out = ("drives_departed", "drives"), ("attacks_out", "attacks")
+    figures = [
+        Column("n", "attacks", terminal=False),
+        Column("mean (m)", "cross_track_mean_m", short="mean"),
+        Column("sd (m)", "cross_track_sd_m", short="± sd"),
+        Column("95 % (m)", "cross_track_mean_ci95_m", short="95 % interval"),
+        Column("wheel out (s)", "wheel_out_s", 2, terminal=False),
+        Column("drives\ndeparted", (*left, ""), page=False),
+        Column("drives out", (*left, "departure_rate_ci95"), terminal=False, bad=True),
+        Column(
+            *("attacks out", (*out, "attacks_out_rate_ci95")),
+            short="attacks\nout",
+            bad=True,
+        ),
+    ]
+    caption = (
+        f"{document['complete']} of {document['cells']} attacks are done. Mean "
+        "distance from the lane centre, over attacks, each of which counts once, with "
+        "standard deviation and 95 % interval (BCa bootstrap); drives with a wheel "
+        f"out, and attacks with one out for {document['departed_s']:g} s in the mean "
+        "over their drives, with Wilson's intervals."
+    )
+    return Table(_MEAN, [*_PLACE, _CASE], figures, groups, 3, caption)
+
+
+def comparisons_table(document: Document) -> Table:
+    """Return attacks beside other drives of the same places, seeds and starts."""
+    figures = [
+        Column("n", "effect.attacks"),
+        Column("ratio", "effect.ratio", 2),
+        Column("95 %", "effect.ratio_ci95", 2),
+        Column("difference (m)", "effect.difference"),
+        Column("95 % (m)", "effect.difference_ci95"),
+        Column("seed sd (m)", "effect.spread"),
+        Column("out here", "departures.one"),
+        Column("out there", "departures.other"),
+        Column("p", "departures.p_value"),
+    ]
+    caption = (
+        "Attacks beside other drives of the same places, seeds and starts: mean error, "
+        "its difference and ratio with 95 % intervals over attacks; the difference's "
+        "standard deviation from seed to seed; attacks that are out on this side alone "
+        "and on the other alone, and McNemar's p-value."
+    )
+    labels, rows = [*_PLACE, Column("beside", _beside)], document["comparisons"]
+    return Table(_MEAN, labels, figures, rows, caption=caption)
+
+
+def attacks_table(rows: Sequence[dict[str, Any]]) -> Table:
+    """Return every attack of a sweep, with the command that repeats it."""
+    figures = [
+        *(_NO_OBJECT, _RANDOM, _ATTACK),
+        Column("wheel out (s)", "wheel_out_s", 2),
+        Column("command", lambda row: Cell(row["repeat"], code=True)),
+    ]
+    rows = [
+        row | {c: {"cross_track_mean_m": mean} for c, mean in row["cases"].items()}
+        for row in rows
+    ]
+    caption = (
+        "Mean distances from the lane centre (m), and seconds with a wheel out past "
+        "the attack, each the mean over the attack's drives."
+    )
+    labels = [
+        *(_ROUTE, Column("objects", "objects"), _METHOD, Column("seed", "seed")),
+        Column("environment", _where),
+    ]
+    return Table(_MEAN, labels, figures, rows, caption=caption)
+
+
+def _cases(document: Document) -> Iterator[dict[str, Any]]:
+    return cells(document["routes"], "route", "environment", "case")
+
+
+def _times_random(cases: Document) -> float | None:
+    attack, chance = (column.of(cases) for column in (_ATTACK, _RANDOM))
+    return attack / chance if attack is not None and chance else None
+
+
+def _method(row: Document) -> str:
+    budget = row["budget"]
+    return str(row["method"]) if budget is None else f"{row['method']} {budget}"
+
+
+def _beside(row: Document) -> str:
+    case, method = row["other_case"].replace("_", " "), row["other_method"]
+    return case if method == row["method"] else f"{method}, {case}"
+
+
+def _where(row: Document) -> str:
+    error = row["error"]
+    return row["environment"] if error is None else f"failed: {error}"
+
+
+_METHOD = Column("method", _method)
+_PLACE = (Column("route", lambda row: row["route"] or "all"), _METHOD, _ENVIRONMENT)

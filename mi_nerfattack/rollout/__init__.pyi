@@ -10,13 +10,13 @@ from .loop import ClosedLoop as ClosedLoop
 from .loop import Trajectory as Trajectory
 from .loop import simulate as simulate
 from .objective import AbstractObjective as AbstractObjective
+from .objective import AbstractReduction as AbstractReduction
+from .objective import CVaR as CVaR
+from .objective import Mean as Mean
 from .objective import StageSum as StageSum
 from .objective import Terminal as Terminal
 from .objective import WeightedSum as WeightedSum
-from .reduction import AbstractReduction as AbstractReduction
-from .reduction import CVaR as CVaR
-from .reduction import Mean as Mean
-from .reduction import Worst as Worst
+from .objective import Worst as Worst
 from .scene_sensor import SceneSensor as SceneSensor
 from .sensor import AbstractDifferentiableSensor as AbstractDifferentiableSensor
 from .sensor import AbstractSensor as AbstractSensor

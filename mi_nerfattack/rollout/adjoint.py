@@ -16,11 +16,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from mi_nerfattack.ranges import Count, checked
 from mi_nerfattack.rollout.loop import ClosedLoop, Step, Trajectory
-from mi_nerfattack.rollout.reduction import Cost
+from mi_nerfattack.rollout.objective import Cost
 from mi_nerfattack.rollout.sweep import Gradient, Options, backward, differentiable
 
 
@@ -54,6 +54,7 @@ class AbstractAdjoint(ABC):
 
 
 @dataclass(frozen=True)
+@checked()
 class Replay(AbstractAdjoint):
     """Keeps states, and the policy's memory where it has one; renders all again.
 
@@ -63,6 +64,8 @@ class Replay(AbstractAdjoint):
     policy's derivative, and march derivatives of the rays that meet objects; forward
     and backward together about 2.4 forward passes.
     """
+
+    kind: Literal["replay"] = "replay"
 
     def keep(self, loop: ClosedLoop, step: Step) -> Any:
         """See :meth:`AbstractAdjoint.keep`."""
@@ -77,6 +80,7 @@ class Replay(AbstractAdjoint):
 
 
 @dataclass(frozen=True)
+@checked()
 class KeptBackgrounds(AbstractAdjoint):
     """Keeps how scene and objects looked in each frame; renders nothing again.
 
@@ -87,6 +91,8 @@ class KeptBackgrounds(AbstractAdjoint):
     together take less than 2 forward passes where the objects fill little of the
     frame. The choice as long as the memory suffices.
     """
+
+    kind: Literal["kept_backgrounds"] = "kept_backgrounds"
 
     def keep(self, loop: ClosedLoop, step: Step) -> Any:
         """See :meth:`AbstractAdjoint.keep`."""
@@ -116,6 +122,7 @@ class Checkpointed(AbstractAdjoint):
     """
 
     segment: Count = 16
+    kind: Literal["checkpointed"] = "checkpointed"
 
     def keep(self, loop: ClosedLoop, step: Step) -> Any:
         """See :meth:`AbstractAdjoint.keep`."""

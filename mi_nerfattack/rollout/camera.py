@@ -9,7 +9,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera.intrinsics import CameraMount, mount_pose
+from mi_nerfattack.render.camera.intrinsics import CameraMount
+from mi_nerfattack.render.camera.lens import mount_pose
 
 
 class SceneCamera:

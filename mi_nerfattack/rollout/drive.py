@@ -22,7 +22,9 @@ ENVIRONMENTS = (
     "mujoco_gl",
     "replay",
     "carla",
+    "real",
 )
+REAL = "real"
 
 #: What objects show in a drive.
 NO_OBJECT, OWN, RANDOM, BEST_RANDOM, ATTACK = (
@@ -34,6 +36,8 @@ NO_OBJECT, OWN, RANDOM, BEST_RANDOM, ATTACK = (
 )
 #: In the order of documents and plots.
 CASES = (NO_OBJECT, OWN, RANDOM, BEST_RANDOM, ATTACK)
+#: The expert drives without objects.
+EXPERT = "expert"
 _SEVERAL = re.compile(rf"{RANDOM}_([2-9]|[1-9][0-9]+)")
 
 
@@ -45,7 +49,7 @@ class Drive:
     Args:
         environment: its name, one of `ENVIRONMENTS` or your own.
         route: name of the reference route.
-        case: one of `CASES`, or of ``random_case``.
+        case: one of `CASES`, of ``random_case``, or `EXPERT`.
         run: index among the drives of one route, environment and case, from 0.
         seed: seed of this drive.
         states: (T+1, 3), x and y in metres and heading in radians, initial state
@@ -70,7 +74,7 @@ class Drive:
     time_s: np.ndarray
 
     def __post_init__(self) -> None:
-        if self.case not in CASES and not _SEVERAL.fullmatch(self.case):
+        if self.case not in (*CASES, EXPERT) and not _SEVERAL.fullmatch(self.case):
             raise InputError(f"Drive.case: {self.case!r}; one of {', '.join(CASES)}")
         for name in ("run", "seed"):
             object.__setattr__(self, name, int(getattr(self, name)))

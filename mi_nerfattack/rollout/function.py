@@ -20,8 +20,12 @@ from mi_nerfattack.rollout.loop import (
     Trajectory,
     simulate,
 )
-from mi_nerfattack.rollout.objective import AbstractObjective
-from mi_nerfattack.rollout.reduction import AbstractReduction, Cost, Mean
+from mi_nerfattack.rollout.objective import (
+    AbstractObjective,
+    AbstractReduction,
+    Cost,
+    Mean,
+)
 from mi_nerfattack.rollout.sweep import (
     Gradient,
     Options,

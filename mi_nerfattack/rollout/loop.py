@@ -23,10 +23,8 @@ from mi_nerfattack.rollout.sensor import (
     AbstractSensor,
     Observation,
 )
-from mi_nerfattack.vehicle.dynamics import AbstractDynamics
-from mi_nerfattack.vehicle.integrators import AbstractIntegrator
-from mi_nerfattack.vehicle.state import to_state
-from mi_nerfattack.vehicle.transition import Transition
+from mi_nerfattack.vehicle.dynamics import AbstractDynamics, to_state
+from mi_nerfattack.vehicle.integrators import AbstractIntegrator, Transition
 
 OnStep = Callable[[int], None]
 

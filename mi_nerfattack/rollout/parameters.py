@@ -126,8 +126,11 @@ class Differentiated:
             field = self.packed(key)
             name = key.rpartition(".")[2]
             leaf = self._leaves.get(key)
-            found[key] = dr.grad(leaf) if field is None else gradient(field, name)
-        dr.eval(found)
+            if field is None:
+                found[key] = dr.grad(leaf)
+                dr.eval(found[key])
+            else:  # evaluated if it is looked at
+                found[key] = gradient(field, name)
         return found
 
     def finish(self) -> None:

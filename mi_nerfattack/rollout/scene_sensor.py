@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.backend.differentiate import differentiates_rays, vjp
+from mi_nerfattack.backend.arrays import differentiates_rays, vjp
 from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.fields.vertex_colours import gradient
 from mi_nerfattack.render.backdrop import Layer
@@ -85,7 +85,6 @@ class SceneSensor(AbstractDifferentiableSensor):
         self.renders: int = 0
 
     def __repr__(self) -> str:
-        """Name integrator, size and parameters."""
         kind, (width, height) = type(self.integrator).__name__, self.camera.size
         return f"SceneSensor({kind}, {width}x{height}, params={list(self.keys)})"
 

@@ -13,8 +13,8 @@ from mi_nerfattack.backend.arrays import concat, split
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.loop import ClosedLoop, OnStep, Step, Trajectory
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
-from mi_nerfattack.system.heap import release_heap
-from mi_nerfattack.vehicle.state import to_state
+from mi_nerfattack.system.machine import release_heap
+from mi_nerfattack.vehicle.dynamics import to_state
 
 #: Images that go back through the policy at once: what it does with one costs more.
 IMAGES = 4

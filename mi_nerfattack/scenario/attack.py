@@ -1,16 +1,24 @@
-"""The section ``[attack]``: what may change, and the way back through a drive."""
+"""The section ``[attack]``: search method, what may change, and the adjoint."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.attack.base import AbstractAttack
+from mi_nerfattack.attack.black_box.blocks import BlockSearch
+from mi_nerfattack.attack.black_box.low_frequency import LowFrequency
+from mi_nerfattack.attack.black_box.random_looks import RandomLooks, RandomSearch
+from mi_nerfattack.attack.black_box.search import AbstractSearch
+from mi_nerfattack.attack.black_box.surrogate import SurrogateSearch, textured
+from mi_nerfattack.attack.freedom import Freedom, Schedule
+from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.attack.texture.colours import Colours
 from mi_nerfattack.attack.texture.constraints import Constraints
 from mi_nerfattack.attack.texture.gamut import Gamut
@@ -22,44 +30,233 @@ from mi_nerfattack.ranges import (
     NonNegative,
     Positive,
     Share,
+    SomeShare,
+    Whole,
 )
 from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.rollout.adjoint import (
-    AbstractAdjoint,
     Checkpointed,
     KeptBackgrounds,
     Replay,
 )
-from mi_nerfattack.scenario.method import GradientMethod, MethodSection
+from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.scenario.named_file import File
 from mi_nerfattack.scenario.section import Kinds, Section, refuse
+from mi_nerfattack.vehicle.route.route import Route
+
+Population = Annotated[int, Field(ge=2)]
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What an attack is made for.
+
+    Attributes:
+        rollout: the loop, its objective and its adjoint.
+        route: the lane centre.
+        initial: (m, n) that it starts from.
+        freedom: what may change.
+        seed: of the scenario.
+    """
+
+    rollout: Rollout
+    route: Route
+    initial: Any
+    freedom: Freedom
+    seed: int
+
+    @property
+    def fields(self) -> Sequence[GridField]:
+        """Of the objects."""
+        return textured(self.rollout.loop).fields
+
+    @property
+    def frames(self) -> int:
+        """Frames of the drives of one judgement."""
+        return self.rollout.horizon * len(self.initial[0])
+
+
+class AbstractMethod(Section):
+    """A way to search."""
+
+    needs_derivatives: ClassVar[bool]
+
+    @abstractmethod
+    def build(self, task: Task) -> AbstractAttack:
+        """Make the attack, before its first iteration.
+
+        Raises:
+            InputError: it cannot change what it may.
+            TypeError: it needs derivatives, and the policy has none.
+        """
+
+    @abstractmethod
+    def iterations(self, frames: int) -> int:
+        """Return how many iterations there are at most.
+
+        Args:
+            frames: of the drives of one of them.
+        """
+
+    def rendered(self, horizon: int) -> int:
+        """Return how many frames are rendered for a drive of so many periods."""
+        return horizon
+
+
+class AbstractGradientMethod(AbstractMethod):
+    """Adam along a gradient."""
+
+    max_iterations: Count = 48  # fewer where the attack converges before
+    final_rate: SomeShare = 0.1  # of the learning rates, at the end
+    one_level: bool = False  # march objects as one level meanwhile: faster, not exact
+
+    needs_derivatives = True
+
+    def build(self, task: Task) -> AbstractAttack:
+        """See :meth:`AbstractMethod.build`."""
+        schedule = Schedule(self.max_iterations, self.final_rate)
+        rest = task.route, task.initial, task.freedom, schedule
+        return GradientAttack(self._rollout(task), *rest, one_level=self.one_level)
+
+    @abstractmethod
+    def _rollout(self, task: Task) -> Rollout:
+        """Make the drives that are differentiated."""
+
+    def iterations(self, frames: int) -> int:
+        """See :meth:`AbstractMethod.iterations`."""
+        del frames
+        return self.max_iterations
+
+
+class GradientMethod(AbstractGradientMethod):
+    """Of the closed loop, or of the images along an unattacked drive."""
+
+    kind: Literal["gradient", "open_loop"] = "gradient"
+
+    def _rollout(self, task: Task) -> Rollout:
+        if self.kind == "gradient":
+            return task.rollout
+        return task.rollout.open_loop(task.initial)
+
+
+class FrameMethod(AbstractGradientMethod):
+    """Of one frame of an unattacked drive: rendered once, it is shown all the time."""
+
+    kind: Literal["single_frame"]
+    frame: Whole = 0  # of the drive
+
+    def rendered(self, horizon: int) -> int:
+        """See :meth:`AbstractMethod.rendered`."""
+        del horizon
+        return 1
+
+    def _rollout(self, task: Task) -> Rollout:
+        return task.rollout.open_loop(task.initial, self.frame)
+
+
+class AbstractSearchMethod(AbstractMethod):
+    """Drives alone, of textures."""
+
+    frames: Count = 6000  # rendered; the drives that reach it are the last
+
+    needs_derivatives = False
+
+    def build(self, task: Task) -> AbstractAttack:
+        """See :meth:`AbstractMethod.build`."""
+        if task.freedom.texture_rate is None or task.freedom.pose_rate is not None:
+            raise InputError(
+                "attack.freedom.kind: searches change textures alone; set it to "
+                "'texture', or attack.method.kind to 'gradient'"
+            )
+        search = self._search(task)
+        parts = task.rollout, task.route, task.initial, task.freedom
+        return SurrogateSearch(search, *parts, self.frames)
+
+    @abstractmethod
+    def _search(self, task: Task) -> AbstractSearch:
+        """Make what proposes textures."""
+
+    def iterations(self, frames: int) -> int:
+        """See :meth:`AbstractMethod.iterations`."""
+        return -(-self.frames // frames)
+
+
+class RandomMethod(AbstractSearchMethod):
+    """Random textures."""
+
+    kind: Literal["random"]
+    texture_kind: Literal["noise", "blobs", "flat", "mixed"] = "mixed"
+
+    def _search(self, task: Task) -> AbstractSearch:
+        fields = task.fields
+        seed = task.seed + (1 << 31)  # other draws than those of the baseline
+        return RandomSearch(RandomLooks(fields, task.freedom, self.texture_kind, seed))
+
+
+class BlockMethod(AbstractSearchMethod):
+    """Random colours of blocks."""
+
+    kind: Literal["blocks"]
+    first_block: SomeShare = 0.3  # of the lattice
+
+    def _search(self, task: Task) -> AbstractSearch:
+        proposals = self.iterations(task.frames)
+        fields = task.fields
+        rest = proposals, self.first_block, task.seed
+        return BlockSearch(_colourings(task), fields, *rest)
+
+
+class EvolutionMethod(AbstractSearchMethod):
+    """CMA-ES."""
+
+    kind: Literal["cma_es"]
+    variant: Literal["separable", "learning_rate"] = "separable"
+    coefficients: Count = 256  # of all objects, at most
+    spread: Positive = 0.3  # of the first samples, sRGB
+    population: Population | None = None
+
+    def _search(self, task: Task) -> AbstractSearch:
+        from mi_nerfattack.attack.black_box.evolution import EvolutionSearch
+
+        basis = LowFrequency(_colourings(task), self.coefficients)
+        rest = self.variant, self.spread, self.population, task.seed
+        return EvolutionSearch(basis, *rest)
+
+
+class BayesianMethod(AbstractSearchMethod):
+    """A Gaussian process."""
+
+    kind: Literal["bayesian"]
+    coefficients: Annotated[int, Field(ge=1, le=64)] = 64  # of all objects, at most
+
+    def _search(self, task: Task) -> AbstractSearch:
+        from mi_nerfattack.attack.black_box.bayesian import BayesianSearch
+
+        basis = LowFrequency(_colourings(task), self.coefficients)
+        return BayesianSearch(basis, seed=task.seed)
+
+
+def _colourings(task: Task) -> list[Colours]:
+    found = [task.freedom.colouring(field) for field in task.fields]
+    return [item for item in found if isinstance(item, Colours)]  # which all are
+
+
+MethodSection = Annotated[
+    GradientMethod
+    | FrameMethod
+    | RandomMethod
+    | BlockMethod
+    | EvolutionMethod
+    | BayesianMethod,
+    Kinds("gradient"),
+]
+
 
 Corner = tuple[Finite, Finite, Finite]
 Box = tuple[Corner, Corner]
 Resolution = Annotated[int, Field(ge=2, le=512)]
 Smoothing = Annotated[int, Field(ge=0, le=8)]
 Axis = Literal["x", "y", "z", "roll", "pitch", "yaw"]
-
-
-class PlainAdjoint(Section):
-    """Costates solved for period by period; each frame is rendered again."""
-
-    adjoint: Literal["replay", "kept_backgrounds"] = "replay"
-
-    def build(self) -> AbstractAdjoint:
-        """Make the way back through a drive."""
-        return KeptBackgrounds() if self.adjoint == "kept_backgrounds" else Replay()
-
-
-class CheckpointedAdjoint(Section):
-    """Segments differentiated one by one."""
-
-    adjoint: Literal["checkpointed"]
-    segment: Count = 16  # control periods between the checkpoints
-
-    def build(self) -> AbstractAdjoint:
-        """Make the way back through a drive."""
-        return Checkpointed(self.segment)
 
 
 class AbstractTextureFreedom(Section):
@@ -111,7 +308,7 @@ class AbstractTextureFreedom(Section):
 class TextureFreedom(AbstractTextureFreedom):
     """Textures may change."""
 
-    parameters: Literal["texture"] = "texture"
+    kind: Literal["texture"] = "texture"
 
     def build(self) -> Freedom:
         """Say what the attack may change."""
@@ -135,7 +332,7 @@ class AbstractPoseFreedom(Section):
 class PoseFreedom(AbstractPoseFreedom):
     """Objects alone may change."""
 
-    parameters: Literal["pose"]
+    kind: Literal["pose"]
 
     def build(self) -> Freedom:
         """Say what the attack may change."""
@@ -145,7 +342,7 @@ class PoseFreedom(AbstractPoseFreedom):
 class BothFreedom(AbstractTextureFreedom, AbstractPoseFreedom):
     """Textures may change, too."""
 
-    parameters: Literal["both"]
+    kind: Literal["both"]
 
     def build(self) -> Freedom:
         """Say what the attack may change."""
@@ -155,13 +352,13 @@ class BothFreedom(AbstractTextureFreedom, AbstractPoseFreedom):
 class AttackSection(Section):
     """How textures and poses are optimised."""
 
-    method: MethodSection = Field(default=GradientMethod(), validation_alias="(method)")
+    method: MethodSection = GradientMethod()
     poses: Count = 1  # initial poses of an iteration; the first is nominal
-    freedom: Annotated[
-        TextureFreedom | PoseFreedom | BothFreedom, Kinds("parameters")
-    ] = Field(default=TextureFreedom(), validation_alias="(freedom)")
-    adjoint: Annotated[PlainAdjoint | CheckpointedAdjoint, Kinds("adjoint")] = Field(
-        default=PlainAdjoint(), validation_alias="(adjoint)"
+    freedom: Annotated[TextureFreedom | PoseFreedom | BothFreedom, Kinds("texture")] = (
+        TextureFreedom()
+    )
+    adjoint: Annotated[Replay | KeptBackgrounds | Checkpointed, Kinds("replay")] = (
+        Replay()
     )
     attached: bool = False
     jitter: bool = False

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 from weakref import WeakKeyDictionary
 
-from pydantic import Field, PlainValidator, SerializeAsAny, TypeAdapter, ValidationInfo
+from pydantic import Discriminator, Field, Tag
 
 from mi_nerfattack.deploy.built_in import BuiltInObject, make_built_in
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.place import Conditions, Place
 from mi_nerfattack.deploy.registry import make_environment
 from mi_nerfattack.fields.grid import GridField
-from mi_nerfattack.io.digest import array_digest
+from mi_nerfattack.io.resumable import array_digest
 from mi_nerfattack.ranges import Count, Finite, NonNegative
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.scenario.named_file import File
-from mi_nerfattack.scenario.section import Kinds, Section
+from mi_nerfattack.scenario.section import UNTAGGED, Kinds, Section
 
 #: What the environment of attacks is called, and the deployment without a name.
 SURROGATE, DEPLOYMENT = "surrogate", "deployment"
@@ -56,20 +56,20 @@ class AbstractSimulatedDeployment(AbstractDeploymentSection):
 class RenderedDeployment(AbstractSimulatedDeployment):
     """Images by Mitsuba; `mujoco` drives a car with wheels."""
 
-    environment: Literal["mitsuba", "mujoco"] = "mitsuba"
+    kind: Literal["mitsuba", "mujoco"] = "mitsuba"
     spp: Count = 16
 
 
 class RasterisedDeployment(AbstractSimulatedDeployment):
     """Images by MuJoCo, and its car with wheels."""
 
-    environment: Literal["mujoco_gl"]
+    kind: Literal["mujoco_gl"]
 
 
 class CarlaDeployment(AbstractDeploymentSection):
     """A running CARLA server; experimental."""
 
-    environment: Literal["carla"]
+    kind: Literal["carla"]
     sky: Sky = "day"
     exposure_ev: Finite = 0.0
     server: str = "127.0.0.1:2000"  # HOST:PORT or HOST:PORT/TOWN
@@ -82,49 +82,37 @@ class CarlaDeployment(AbstractDeploymentSection):
 class ReplayDeployment(AbstractDeploymentSection):
     """A recorded drive, in which controls have no effect."""
 
-    environment: Literal["replay"]
+    kind: Literal["replay"]
     recording: File  # folder, video or MCAP log
+    topics: tuple[str, ...] = ()  # of a log: "image=/front", "vehicle_pose=/odom"
 
     def place(self, place: Place) -> Place:
         """Name the recording."""
-        return replace(place, recording=self.recording.file)
+        return replace(place, recording=self.recording.file, topics=self.topics)
 
 
-_KINDS = Annotated[
+DeploymentSection = Annotated[
     RenderedDeployment | RasterisedDeployment | CarlaDeployment | ReplayDeployment,
-    Kinds("environment"),
+    Kinds("mitsuba"),
 ]
-_ONE: TypeAdapter[Any] = TypeAdapter(_KINDS)
-_SEVERAL: TypeAdapter[Any] = TypeAdapter(
-    Annotated[tuple[_KINDS, ...], Field(min_length=1)]
-)
-
-
-def _read(value: Any, info: ValidationInfo) -> Any:
-    kind = _SEVERAL if isinstance(value, tuple) else _ONE
-    return kind.validate_python(value, context=info.context)
-
-
+_Several = Annotated[tuple[DeploymentSection, ...], Field(min_length=1)]
 #: A table, or an array of tables.
 DeploymentSections = Annotated[
-    SerializeAsAny[AbstractDeploymentSection]
-    | tuple[SerializeAsAny[AbstractDeploymentSection], ...],
-    PlainValidator(_read),
+    Annotated[DeploymentSection, Tag("table")] | Annotated[_Several, Tag("array")],
+    Discriminator(lambda given: "array" if isinstance(given, tuple) else "table"),
+    UNTAGGED,
 ]
 
 
-def labelled(
-    given: AbstractDeploymentSection | Sequence[AbstractDeploymentSection],
-) -> list[tuple[str, AbstractDeploymentSection]]:
+def labelled(given: DeploymentSections) -> list[tuple[str, DeploymentSection]]:
     """Return each section with its label.
 
-    A section without a name is called by its environment; "deployment" if it is alone.
+    A section without a name is called by its kind; "deployment" if it is alone.
     """
-    sections = [given] if isinstance(given, AbstractDeploymentSection) else given
+    sections = given if isinstance(given, tuple) else [given]
     alone = len(sections) == 1
     return [
-        (item.name or (DEPLOYMENT if alone else item.model_dump()["environment"]), item)
-        for item in sections
+        (item.name or (DEPLOYMENT if alone else item.kind), item) for item in sections
     ]
 
 
@@ -183,10 +171,7 @@ def _built_in(field: GridField, pose: Pose) -> BuiltInObject:
     return replace(found, pose=pose)
 
 
-def deployments(
-    given: AbstractDeploymentSection | Sequence[AbstractDeploymentSection],
-    place: Place,
-) -> Mapping[str, Deployment]:
+def deployments(given: DeploymentSections, place: Place) -> Mapping[str, Deployment]:
     """Return the deployments of a scenario by label, in its order.
 
     Args:
@@ -198,6 +183,6 @@ def deployments(
         values = section.model_dump()
         names = ("sky", "exposure_ev", "spp", "blur_px", "noise_sd")
         conditions = Conditions(**{n: values[n] for n in names if n in values})
-        name, builds_in = values["environment"], values.get("objects") == "built-in"
-        found[label] = Deployment(name, section.place(place), conditions, builds_in)
+        builds_in, there = values.get("objects") == "built-in", section.place(place)
+        found[label] = Deployment(section.kind, there, conditions, builds_in)
     return found

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import PlainSerializer, PlainValidator, ValidationInfo
+from pydantic import PlainSerializer, PlainValidator, ValidationInfo, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
+from mi_nerfattack.scenario.section import Section
 from mi_nerfattack.scenario.user_code import (
     check_trust,
     import_function,
@@ -138,7 +139,9 @@ def _files_of(scene: Path) -> list[Path]:
 
 def _folder_digest(folder: Path) -> str:
     digest = hashlib.sha256()
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+    with files.reported(folder):
+        paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    for path in paths:
         name = path.relative_to(folder).as_posix()
         digest.update(f"{name} {files.sha256(path)}\n".encode())
     return digest.hexdigest()
@@ -149,7 +152,18 @@ def _read(path: Path) -> bytes:
 
 
 _NAME = PlainSerializer(str, return_type=str)
+_TEXT = WithJsonSchema({"type": "string"})
 #: Types of keys: a file; ``FILE.py:NAME``; that or ``package.module:NAME``.
-File = Annotated[NamedFile, PlainValidator(_file), _NAME]
-Code = Annotated[NamedFile, PlainValidator(_code), _NAME]
-AnyCode = Annotated[NamedFile, PlainValidator(_any_code), _NAME]
+File = Annotated[NamedFile, PlainValidator(_file), _NAME, _TEXT]
+Code = Annotated[NamedFile, PlainValidator(_code), _NAME, _TEXT]
+AnyCode = Annotated[NamedFile, PlainValidator(_any_code), _NAME, _TEXT]
+
+
+def section_content(section: Section) -> dict[str, Any]:
+    """Return what a policy's or vehicle's section says as JSON, files by checksums."""
+    values = section.model_dump(mode="json", exclude_defaults=True)
+    for (key, *_), value in section.leaves():
+        if isinstance(value, NamedFile):
+            values.pop(str(key))
+            values[f"{key}_sha256"] = value.content()["sha256"]
+    return values

@@ -8,113 +8,43 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from mi_nerfattack.attack import weights
 from mi_nerfattack.attack.objectives import (
     AbsoluteDeviation,
     CrossTrackDeviation,
     DepartureTime,
+    Discounted,
+    End,
     HeadingDeviation,
+    LastSeconds,
+    Linear,
+    Listed,
     TargetDistance,
+    Uniform,
 )
 from mi_nerfattack.attack.user_cost import UserCost
-from mi_nerfattack.ranges import Finite, Positive, SomeShare
+from mi_nerfattack.ranges import Finite, Positive
 from mi_nerfattack.rollout.drive import departure_limit
 from mi_nerfattack.rollout.objective import (
     AbstractObjective,
+    CVaR,
+    Mean,
     StageCost,
     StageSum,
     Terminal,
     WeightedSum,
+    Worst,
 )
-from mi_nerfattack.rollout.reduction import AbstractReduction, CVaR, Mean, Worst
 from mi_nerfattack.scenario.named_file import Code, File
 from mi_nerfattack.scenario.section import Kinds, Section, Trust
-from mi_nerfattack.vehicle.dynamics import AbstractDynamics
+from mi_nerfattack.vehicle.dynamics import AbstractDynamics, to_state
 from mi_nerfattack.vehicle.route.route import Route
-from mi_nerfattack.vehicle.state import to_state
 
 if TYPE_CHECKING:
     from mi_nerfattack.scenario.scenario import Scenario
 
-# Weights of the times
-
-
-class PlainWeights(Section):
-    """Equal weights, or such that grow with time."""
-
-    weights: Literal["uniform", "linear"] = "uniform"
-
-    def build(self, steps: int, dt: float) -> np.ndarray | None:
-        """Return a weight a control period of `dt` seconds; None for equal ones."""
-        return weights.linear(steps) if self.weights == "linear" else None
-
-
-class LastWeights(Section):
-    """The last seconds alone."""
-
-    weights: Literal["last"]
-    last_s: Positive
-
-    def build(self, steps: int, dt: float) -> np.ndarray:
-        """Return the weights."""
-        return weights.last_seconds(steps, dt, self.last_s)
-
-
-class DiscountWeights(Section):
-    """Weights that fade with time."""
-
-    weights: Literal["discount"]
-    discount_per_s: SomeShare
-
-    def build(self, steps: int, dt: float) -> np.ndarray:
-        """Return the weights."""
-        return weights.discounted(steps, dt, self.discount_per_s)
-
-
-class ListedWeights(Section):
-    """Weights of the user's."""
-
-    weights: Literal["listed"]
-    listed_weights: tuple[Finite, ...]  # one a control period
-
-    def build(self, steps: int, dt: float) -> np.ndarray:
-        """Return the weights."""
-        return weights.listed(steps, self.listed_weights)
-
-
 Weights = Annotated[
-    PlainWeights | LastWeights | DiscountWeights | ListedWeights, Kinds("weights")
+    Uniform | Linear | LastSeconds | Discounted | Listed | End, Kinds("uniform")
 ]
-
-# States that count
-
-
-class AllTimes(Section):
-    """The states after all control periods."""
-
-    at: Literal["all_times"] = "all_times"
-    weights: Weights = Field(default=PlainWeights(), validation_alias="(weights)")
-
-    def build(
-        self, cost: StageCost, scenario: Scenario, route: Route
-    ) -> AbstractObjective:
-        """Sum the cost over time."""
-        dt = scenario.vehicle.dt_s
-        steps = scenario.drive.steps(route, dt)
-        return StageSum(cost, self.weights.build(steps, dt))
-
-
-class AtEnd(Section):
-    """The last state alone."""
-
-    at: Literal["end"]
-
-    def build(
-        self, cost: StageCost, scenario: Scenario, route: Route
-    ) -> AbstractObjective:
-        """Take the cost of the last state."""
-        return Terminal(cost)
-
 
 # Terms
 
@@ -150,15 +80,17 @@ class DepartureTimeTerm(AbstractTerm):
 class AbstractStageTerm(AbstractTerm):
     """A cost of states."""
 
-    at: Annotated[AllTimes | AtEnd, Kinds("at")] = Field(
-        default=AllTimes(), validation_alias="(at)"
-    )
+    weights: Weights = Uniform()
 
     def build(
         self, scenario: Scenario, route: Route, dynamics: AbstractDynamics
     ) -> AbstractObjective:
         """Make the term."""
-        return self.at.build(self.cost(route, dynamics), scenario, route)
+        dt = scenario.vehicle.dt_s
+        cost, steps = self.cost(route, dynamics), scenario.drive.steps(route, dt)
+        if isinstance(self.weights, End):
+            return Terminal(cost)
+        return StageSum(cost, self.weights.of(steps, dt))
 
     @abstractmethod
     def cost(self, route: Route, dynamics: AbstractDynamics) -> StageCost:
@@ -220,7 +152,7 @@ class FunctionTerm(AbstractStageTerm):
 
     def cost(self, route: Route, dynamics: AbstractDynamics) -> StageCost:
         """Load the function and try it beside the lane, off its centre."""
-        function = self.function.load("objective.function", self.trust_code)
+        function = self.function.load("objective.term.function", self.trust_code)
         cost = UserCost(self.function.name, function)
         arc = np.array([0.25, 0.75]) * route.length
         poses = route.pose_at(arc, np.array([0.31, -0.17]), np.array([0.07, -0.05]))
@@ -235,41 +167,15 @@ Term = Annotated[
     | TargetPathTerm
     | FunctionTerm
     | DepartureTimeTerm,
-    Kinds("kind"),
+    Kinds("cross_track"),
 ]
-
-# Reductions over the initial poses
-
-
-class PlainReduction(Section):
-    """The mean of the costs, or the largest."""
-
-    reduction: Literal["mean", "worst"] = "mean"
-
-    def build(self) -> AbstractReduction:
-        """Make the reduction."""
-        return Worst() if self.reduction == "worst" else Mean()
-
-
-class CVaRReduction(Section):
-    """The mean of the largest costs."""
-
-    reduction: Literal["cvar"]
-    cvar_fraction: SomeShare
-
-    def build(self) -> AbstractReduction:
-        """Make the reduction."""
-        return CVaR(self.cvar_fraction)
 
 
 class ObjectiveSection(Section):
-    """What the attack makes smaller: the sum of a term and further ones."""
+    """What the attack makes smaller: the sum of terms."""
 
-    first: Term = Field(default=CrossTrackTerm(), validation_alias="(first)")
-    reduction: Annotated[PlainReduction | CVaRReduction, Kinds("reduction")] = Field(
-        default=PlainReduction(), validation_alias="(reduction)"
-    )
-    terms: tuple[Term, ...] = ()
+    term: Annotated[tuple[Term, ...], Field(min_length=1)] = (CrossTrackTerm(),)
+    reduction: Annotated[Mean | Worst | CVaR, Kinds("mean")] = Mean()
 
     def build(
         self, scenario: Scenario, route: Route, dynamics: AbstractDynamics
@@ -286,9 +192,8 @@ class ObjectiveSection(Section):
                 something else than costs, or weights do not fit the horizon.
         """
         terms = tuple(
-            (term.weight, term.build(scenario, route, dynamics))
-            for term in (self.first, *self.terms)
+            (term.weight, term.build(scenario, route, dynamics)) for term in self.term
         )
-        if len(terms) == 1 and self.first.weight == 1:
+        if len(terms) == 1 and self.term[0].weight == 1:
             return terms[0][1]
         return WeightedSum(terms)

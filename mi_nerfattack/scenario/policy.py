@@ -8,21 +8,21 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from mi_nerfattack.errors import InputError, is_interrupt
+from mi_nerfattack.io.network import read_token
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.policy.black_box import DIFFERENTIABLE_KINDS, CallablePolicy
 from mi_nerfattack.policy.drjit_network import DrJitNetwork
-from mi_nerfattack.policy.exported.load import load_exported, load_torchscript
+from mi_nerfattack.policy.exported import load_exported, load_torchscript
 from mi_nerfattack.policy.goals import (
-    AbstractGoal,
     IntegerGoal,
     NoGoal,
     OneHotGoal,
     declared_goal,
 )
-from mi_nerfattack.policy.http_policy import HttpPolicy
+from mi_nerfattack.policy.http.policy import HttpPolicy
 from mi_nerfattack.policy.one_image import OneImage
 from mi_nerfattack.policy.pilotnet import PilotNet, stored_unit
 from mi_nerfattack.policy.preprocess import (
@@ -90,7 +90,6 @@ class PreprocessSection(Section):
 
     @model_validator(mode="after")
     def _check_crops(self) -> Any:
-        """Refuse two crops."""
         if self.crop_px is not None and self.crop_fraction is not None:
             refuse("crop_fraction", "stands beside crop_px; give one of them")
         return self
@@ -109,28 +108,6 @@ class PreprocessSection(Section):
         if (self.scale, self.mean, self.std) != (1.0, (0.0,), (1.0,)):
             transforms.append(Normalise(self.scale, self.mean, self.std))
         return Preprocess(transforms, self.frames, self.stride, LAYOUTS[self.layout])
-
-
-class PlainGoal(Section):
-    """No goal, or the one that the network declares."""
-
-    goal: Literal["none", None] = None  # None: as declared_goal finds
-
-    def build(self, module: torch.nn.Module) -> AbstractGoal:
-        """Make what passes the goal to a network."""
-        return declared_goal(module) if self.goal is None else NoGoal()
-
-
-class NumberedGoal(Section):
-    """One of a number of goals."""
-
-    goal: Literal["integer", "one_hot"]
-    goals: Count
-
-    def build(self, module: torch.nn.Module) -> AbstractGoal:
-        """Make what passes the goal to a network."""
-        del module
-        return (IntegerGoal if self.goal == "integer" else OneHotGoal)(self.goals)
 
 
 class AbstractPolicySection(Section):
@@ -160,9 +137,7 @@ class AbstractNetworkSection(AbstractPolicySection):
     """A network with derivatives."""
 
     file: File
-    goal: Annotated[PlainGoal | NumberedGoal, Kinds("goal")] = Field(
-        default=PlainGoal(), validation_alias="(goal)"
-    )
+    goal: Annotated[NoGoal | IntegerGoal | OneHotGoal, Kinds()] | None = None
     batch: Literal[1] | None = None  # where it takes one image at a time
 
     def _policy(
@@ -179,7 +154,7 @@ class AbstractNetworkSection(AbstractPolicySection):
             )
         return TorchPolicy(
             module if batch is None else OneImage(module, recurrent),
-            self.goal.build(module),
+            declared_goal(module) if self.goal is None else self.goal,
             self.preprocess.build(),
             recurrent,
             self.control_scale,
@@ -249,8 +224,8 @@ class ModuleSection(AbstractNetworkSection):
             if not torch.equal(value, again.get(name, value)):
                 raise InputError(
                     f"{self.source}: its weights are random: {name!r} differs each "
-                    "time that it is made; give policy.weights_file (--weights-file), "
-                    "or load them in the Python file"
+                    "time that it is made; give policy.weights_file, or load them in "
+                    "the Python file"
                 )
 
 
@@ -259,6 +234,13 @@ class ProgramSection(AbstractNetworkSection):
 
     kind: Literal["exported", "torchscript", "onnx"]
     recurrent: Shapes = ()
+    output_name: str | None = None  # of the control, in an ONNX file with several
+
+    @model_validator(mode="after")
+    def _check_output_name(self) -> Any:
+        if self.output_name is not None and self.kind != "onnx":
+            refuse("output_name", "is of ONNX files alone; leave it out")
+        return self
 
     def build(self) -> AbstractPolicy:
         """Load the program."""
@@ -267,8 +249,12 @@ class ProgramSection(AbstractNetworkSection):
             check_trust("policy.file", self.source, self.trust_code)
         if self.kind == "torchscript":
             network = load_torchscript(path)
+        elif self.kind == "exported":
+            network = load_exported(path)
+            batch = network.batch
         else:
-            network = (load_exported if self.kind == "exported" else _load_onnx)(path)
+            network = _load_onnx(path)
+            network.choose(self.output_name, len(self.recurrent))
             batch = network.batch
         return self._policy(network, batch, self.recurrent)
 
@@ -311,29 +297,31 @@ class HttpSection(AbstractPolicySection):
     url: str
     timeout_s: Positive = 10.0  # of an answer
     retries: Whole = 2
+    token_file: Annotated[File | None, Field(exclude=True)] = None  # no result's
 
     def build(self) -> AbstractPolicy:
         """Make the client."""
-        preprocess, scale = self.preprocess.build(), self.control_scale
         return HttpPolicy(
-            self.url, self.timeout_s, self.retries, preprocess, scale, self.output
+            self.url,
+            self.timeout_s,
+            self.retries,
+            self.preprocess.build(),
+            self.control_scale,
+            self.output,
+            "" if self.token_file is None else read_token(self.token_file.file),
         )
 
 
-def _tell_kind(data: Any) -> Any:
+def _kind_of(keys: dict[str, Any]) -> str:
     """Tell the kind by the suffix of the file, where it is left out."""
-    if not isinstance(data, dict):
-        return data
-    file, url = data.get("file"), data.get("url")
-    if (file is None) == (url is None):
+    file = keys.get("file")
+    if (file is None) == (keys.get("url") is None):
         refuse("file", "give either file or url")
-    if data.get("kind") is not None:
-        return data
     if file is None:
-        return {**data, "kind": "http"}
+        return "http"
     suffix = ".py" if ".py:" in str(file) else Path(str(file)).suffix.lower()
     if suffix in SUFFIXES:
-        return {**data, "kind": SUFFIXES[suffix]}
+        return SUFFIXES[suffix]
     if ":" in str(file):
         refuse(
             "file",
@@ -354,8 +342,7 @@ PolicySection = Annotated[
     | DrJitSection
     | CallableSection
     | HttpSection,
-    Kinds("kind"),
-    BeforeValidator(_tell_kind),
+    Kinds(_kind_of),
 ]
 
 

@@ -20,6 +20,8 @@ from pydantic import Field, ValidationError, model_validator
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
+from mi_nerfattack.io.overrides import set_keys
+from mi_nerfattack.io.strict import parse_toml
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.ranges import Count, Finite, Fraction, NonNegative, Positive, Whole
 from mi_nerfattack.render.camera.pose import Pose
@@ -31,7 +33,6 @@ from mi_nerfattack.scenario.deployment import (
     RenderedDeployment,
     labelled,
 )
-from mi_nerfattack.scenario.lines import tell
 from mi_nerfattack.scenario.named_file import File, NamedFile
 from mi_nerfattack.scenario.objective import ObjectiveSection
 from mi_nerfattack.scenario.policy import (
@@ -39,8 +40,15 @@ from mi_nerfattack.scenario.policy import (
     PolicySection,
     build_differentiable,
 )
-from mi_nerfattack.scenario.section import Section, problems, refuse
-from mi_nerfattack.scenario.vehicle import CameraSection, DubinsSection, VehicleSection
+from mi_nerfattack.scenario.section import (
+    CameraSection,
+    Section,
+    problems,
+    refuse,
+    tell,
+)
+from mi_nerfattack.scenario.upgrade import new_lines
+from mi_nerfattack.scenario.vehicle import DubinsSection, VehicleSection
 from mi_nerfattack.vehicle.route.route import Route
 
 #: Returns the name of a file without its folder, and the SHA-256 of its content.
@@ -56,7 +64,7 @@ Row = tuple[Finite, Finite, Finite, Finite]
 class SceneSection(Section):
     """Where the drive takes place."""
 
-    field: File | None = None  # or .ply of Gaussian splats: the surrogate
+    field: File | None = None  # or splats: the surrogate
     bricks: File | None = None  # of field, by bake: attacks are optimised in them
     surrogate: File | None = None  # Mitsuba scene XML with a field_integrator, instead
     deployment: File  # Mitsuba scene XML: the deployment environment
@@ -150,7 +158,6 @@ class DriveSection(Section):
 
     @model_validator(mode="after")
     def _check_end(self) -> Any:
-        """Refuse two ends."""
         if self.horizon is not None and self.length_m is not None:
             refuse("horizon", "stands beside length_m; give one of them, or neither")
         return self
@@ -203,7 +210,7 @@ class Scenario(Section):
         return (
             f"Scenario({self.name!r}, route {self.scene.route!r}, "
             f"objects: {len(self.objects)}, policy {Path(self.policy.source).name}, "
-            f"{self.attack.method.method} attack)"
+            f"{self.attack.method.kind} attack)"
         )
 
     def build_policy(self) -> AbstractPolicy:
@@ -231,7 +238,7 @@ class Scenario(Section):
             self._check_placed()
         else:
             self._check_named(self.scene.surrogate)
-        model, sections = self.vehicle.model, labelled(self.deployment)
+        model, sections = self.vehicle.kind, labelled(self.deployment)
         labels = [label for label, _ in sections]
         if len(set(labels)) != len(labels) or SURROGATE in labels:
             refuse(
@@ -241,18 +248,18 @@ class Scenario(Section):
             )
         if model == "custom":
             for label, section in sections:
-                name = section.model_dump()["environment"]
-                if name.startswith("mujoco"):
+                kind = section.kind
+                if kind.startswith("mujoco"):
                     refuse(
                         "deployment",
-                        f"{label}: {name} drives a car with wheels, whose control is "
+                        f"{label}: {kind} drives a car with wheels, whose control is "
                         "not that of a custom vehicle; take mitsuba",
                     )
         if isinstance(self.policy, PilotNetSection) and model != "custom":
             given, taken = self.policy.unit(), "rad" if model in STEERED else "rad/s"
             if given not in (None, taken):
                 told = f"takes {taken}, and {self.policy.source} gives {given}"
-                refuse("vehicle.model", f"{model} {told}; take another of them")
+                refuse("vehicle.kind", f"{model} {told}; take another of them")
         return self
 
     def _check_placed(self) -> None:
@@ -263,7 +270,7 @@ class Scenario(Section):
 
     def _check_named(self, xml: NamedFile) -> None:
         """Refuse what the Mitsuba scene of the surrogate says itself."""
-        lens = ("width", "height", "fov_x_deg", *CameraSection.later)
+        lens = ("width", "height", "fov_x_deg", *CameraSection.lens)
         groups = [("camera", self.camera, lens), ("attack", self.attack, ("jitter",))]
         own = ("field", "position_m", "yaw_deg", "scale", "step_m")
         groups += [(f"objects.{i}", item, own) for i, item in enumerate(self.objects)]
@@ -334,13 +341,14 @@ def is_within(key: str, names: Sequence[str]) -> bool:
 
 
 def load_scenario(
-    path: str | Path, object_field: Path | None = None
+    path: str | Path, object_field: Path | None = None, settings: Sequence[str] = ()
 ) -> tuple[Scenario, str]:
     """Read and check a scenario file.
 
     Args:
         path: the file.
         object_field: grid field that replaces the one of every object.
+        settings: keys that replace those of the file, see `overrides.set_keys`.
 
     Returns:
         the scenario, and the text of the file with what was replaced.
@@ -350,6 +358,10 @@ def load_scenario(
             missing, of the wrong type or out of range; with file and line.
     """
     text, data = files.read_text(path), files.read_toml(path)
+    own = text
+    if settings:
+        text = set_keys(str(path), own, settings)
+        data = parse_toml(path, text)
     if len(text) > _MAX_CHARACTERS:
         raise InputError(
             f"{path}: {len(text)} characters; a scenario has at most {_MAX_CHARACTERS}"
@@ -358,7 +370,8 @@ def load_scenario(
         folder = {"folder": Path(path).parent}
         scenario = Scenario.model_validate(data, context=folder)
     except ValidationError as err:
-        raise InputError(tell(path, text, problems(err))) from err
+        told = new_lines(path, own) or tell(path, text, problems(err), settings)
+        raise InputError(told) from err
     if object_field is None:
         return scenario, text
     field = NamedFile(str(object_field.resolve()), object_field.resolve())

@@ -1,163 +1,159 @@
-"""Tables of a scenario file as strict models, and unions of them told by a key.
+"""Tables of a scenario file as strict models, and unions of them told by ``kind``.
 
-A key such as ``model`` of ``[vehicle]`` chooses which other keys the table has. Each
-choice is a :class:`Section` with a `Literal` for that key; :class:`Kinds` marks their
-union. Where several keys choose in one table (``kind`` and ``reduction`` of
-``[objective]``), each union is a field of its own, whose alias stands in parentheses:
-its keys lie *flat*, among those of the table.
+The key ``kind`` of a table such as ``[vehicle]`` chooses which other keys the table
+has. Each choice is a :class:`Section`, or the dataclass that is built, with a `Literal`
+called ``kind``; :class:`Kinds` marks their union. The table ``[camera]`` is here, for
+a real car reads it, too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, is_dataclass, replace
+from inspect import signature
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NoReturn, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, NoReturn, get_args, get_type_hints
 
+import tomlkit
 from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
     GetCoreSchemaHandler,
-    SerializerFunctionWrapHandler,
+    GetJsonSchemaHandler,
     TypeAdapter,
     ValidationError,
-    ValidationInfo,
-    model_serializer,
+    WrapValidator,
     model_validator,
 )
+from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import (
     CoreSchema,
+    ErrorDetails,
     InitErrorDetails,
     PydanticCustomError,
+    core_schema,
 )
-from pydantic_core.core_schema import with_info_plain_validator_function
+from tomlkit.container import OutOfOrderTableProxy
+from tomlkit.items import AoT, Table
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.io.overrides import find_setting
+from mi_nerfattack.ranges import Count, Finite, Positive
+from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
 
 Trust = Annotated[bool, Field(exclude=True)]  # results do not depend on it
 
-_Value = TypeVar("_Value")
 #: Keys and indices that lead to a value of the file.
 Location = tuple[str | int, ...]
 
 _WORDS = {"tuple_type": "must be an array", "model_type": "must be a table"}
+_UNKNOWN = ("unknown", "unexpected_keyword_argument")
+_WORDS |= {"model_attributes_type": "must be a table", "missing": "is missing"}
+
+_MARK = "a line that no file has"
+_MOST_PROBLEMS = 8  # that are told
 
 
 class Section(BaseModel):
-    """A table of the file, or the keys of one kind in it; unknown keys are refused."""
+    """A table of the file, or one kind of it; unknown keys are refused."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(
         extra="forbid", frozen=True, strict=True
     )
 
-    #: Keys that came when there were scenarios already. At their defaults they do not
-    #: count, so that what was made before them is still known by its digest.
-    later: ClassVar[tuple[str, ...]] = ()
-
     @classmethod
     def defaults(cls) -> dict[str, Any]:
-        """Return the keys of the table and their defaults; of kinds, the first's."""
-        found: dict[str, Any] = {}
-        for name, field in cls.model_fields.items():
-            flat = field.validation_alias is not None
-            found |= _defaults(get_args(field.annotation)) if flat else {}
-            found |= {} if flat else {name: field.default}
-        return found
+        """Return the keys of the table and their defaults."""
+        return {name: field.default for name, field in cls.model_fields.items()}
 
     def leaves(self) -> Iterator[tuple[Location, Any]]:
         """Yield the location of each value that counts, and the value."""
-        for name, field in type(self).model_fields.items():
-            value = getattr(self, name)
-            if field.exclude or (name in self.later and value == field.default):
-                continue
-            if isinstance(value, Section):
-                location = () if field.validation_alias else (name,)
-                yield from ((location + rest, leaf) for rest, leaf in value.leaves())
-            elif isinstance(value, tuple) and value and isinstance(value[0], Section):
-                for index, item in enumerate(value):
-                    for rest, leaf in item.leaves():
-                        yield (name, index, *rest), leaf
-            else:
-                yield (name,), value
+        yield from _leaves((), self)
 
     @model_validator(mode="wrap")
     @classmethod
-    def _gather(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
-        """Refuse unknown keys, and put those of each flat union under its alias."""
+    def _read(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
+        """Make tuples of lists, which strict models take; say which keys there are."""
         if not isinstance(data, dict):
             return handler(data)
-        known = cls.defaults()
-        problem = f"unknown key; allowed: {', '.join(known)}"
-        unknown = {key: problem for key in data if key not in known}
-        data = {k: _frozen(v) for k, v in data.items() if k in known}
-        for field in cls.model_fields.values():
-            if isinstance(alias := field.validation_alias, str):
-                keys = _defaults(get_args(field.annotation)).keys() & data.keys()
-                data[alias] = {key: data.pop(key) for key in keys}
-        return _with(unknown, lambda: handler(data))
 
-    @model_serializer(mode="wrap")
-    def _spread(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Write flat unions as they are read."""
-        values = handler(self)
-        for name, field in type(self).model_fields.items():
-            if field.validation_alias is not None and name in values:
-                values |= values.pop(name)
-        return values
+        def reword(error: ErrorDetails) -> tuple[str, Location, str]:
+            location = error["loc"]
+            if error["type"] == "extra_forbidden" and len(location) == 1:
+                keys = ", ".join(cls.model_fields)
+                return "unknown", location, f"unknown key; allowed: {keys}"
+            return error["type"], location, error["msg"]
+
+        return _reworded(lambda: handler(_frozen(data)), reword)
+
+
+def _untagged(data: Any, read: Callable[[Any], Any]) -> Any:
+    def reword(error: ErrorDetails) -> tuple[str, Location, str]:
+        return error["type"], error["loc"][1:], error["msg"]
+
+    return _reworded(lambda: read(data), reword)
+
+
+#: Marks a union with a `Discriminator` whose tags are no keys of the file.
+UNTAGGED = WrapValidator(_untagged)
 
 
 @dataclass(frozen=True)
 class Kinds:
-    """Mark a union of sections that differ in the value of a key.
-
-    Without the key it is the first. Keys of the others are refused.
+    """Mark a union of sections and dataclasses that differ in their ``kind``.
 
     Args:
-        key: that tells them apart.
+        default: the kind of a table without the key; or a function that tells it by
+            the other keys.
     """
 
-    key: str
+    default: str | Callable[[dict[str, Any]], str] | None = None
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
-        """Return a schema that chooses the section."""
-        return with_info_plain_validator_function(
-            lambda data, info: self._read(get_args(source), data, info)
+        """Return a schema that chooses by the kind, and always writes it."""
+        union = Annotated[source, Field(discriminator="kind")]
+        return core_schema.no_info_wrap_validator_function(
+            lambda data, read: self._read(get_args(source), data, read),
+            handler.generate_schema(union),
+            serialization=core_schema.wrap_serializer_function_ser_schema(
+                lambda value, write: {"kind": value.kind} | write(value),
+                schema=handler.generate_schema(union),
+            ),
         )
 
-    def _read(
-        self, members: tuple[type[Section], ...], data: Any, info: ValidationInfo
-    ) -> Section:
-        if isinstance(data, Section):
-            return data
-        if not isinstance(data, dict):
-            return members[0].model_validate(data)
-        given = data.get(self.key)
-        chosen = [m for m in members if given is not None and given in self._values(m)]
-        if given is not None and not chosen:
-            allowed = _either(self._values(*members))
-            refuse(self.key, f"must be {allowed} (is {given!r})")
-        member = [*chosen, *members][0]
-        own, others = member.defaults(), _defaults(members)
-        value, wrong = own[self.key] if given is None else given, {}
-        here, without = f'{self.key} = "{value}"', f"without {self.key}"
-        for key in [key for key in data if key in others and key not in own]:
-            having = [member for member in members if key in member.defaults()]
-            wrong[key] = (
-                f"has no meaning {f'with {here}' if value else without}; leave it "
-                f"out, or set {self.key} to {_either(self._values(*having))}"
-            )
-        for key, field in member.model_fields.items():
-            if field.is_required() and key not in data:
-                wrong[key] = f"is missing; {here} needs it"
-        kept = {k: v for k, v in data.items() if k in own or k not in others}
-        return _with(wrong, lambda: member.model_validate(kept, context=info.context))
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        """Require the key of all kinds but the default."""
+        found = handler(schema)
+        if callable(self.default):
+            return {"anyOf": found["oneOf"]}
+        default = found["discriminator"]["mapping"].get(self.default)
+        others = [item for item in found["oneOf"] if item["$ref"] != default]
+        kinds = [item | {"required": ["kind"]} for item in others]
+        return {"oneOf": [*([{"$ref": default}] if default else []), *kinds]}
 
-    def _values(self, *members: type[Section]) -> tuple[str | None, ...]:
-        fields = [member.model_fields[self.key] for member in members]
-        return tuple(value for field in fields for value in get_args(field.annotation))
+    def _read(
+        self, members: tuple[Any, ...], data: Any, read: Callable[[Any], Any]
+    ) -> Any:
+        if isinstance(data, dict) and data.get("kind") is None:
+            kind = self.default(data) if callable(self.default) else self.default
+            data = {"kind": kind, **{k: v for k, v in data.items() if k != "kind"}}
+
+        def reword(error: ErrorDetails) -> tuple[str, Location, str]:
+            what, location, message = error["type"], error["loc"], error["msg"]
+            if what == "union_tag_invalid":
+                allowed = error.get("ctx", {})["expected_tags"].replace("'", '"')
+                given = f"is {data['kind']!r}" if data["kind"] else "is missing"
+                return "told", ("kind",), f"{given}; one of {allowed}"
+            if len(location) == 2 and what in ("missing", *_UNKNOWN):
+                message, what = _told(members, what, *map(str, location)), "told"
+            return what, location[1:], message
+
+        return _reworded(lambda: read(data), reword)
 
 
 def refuse(key: str, reason: str) -> NoReturn:
@@ -166,21 +162,35 @@ def refuse(key: str, reason: str) -> NoReturn:
     raise ValidationError.from_exception_data("", [_error(way, reason)])
 
 
-def _with(reasons: Mapping[str, str], validate: Callable[[], _Value]) -> _Value:
-    """Validate, and raise what is wrong together with further reasons, by key."""
-    errors = [_error((key,), reason) for key, reason in reasons.items()]
+def _reworded(
+    read: Callable[[], Any],
+    reword: Callable[[ErrorDetails], tuple[str, Location, str]],
+) -> Any:
+    """Read a value, and raise its errors with other types, locations and messages."""
     try:
-        result = validate()
+        return read()
     except ValidationError as err:
-        errors += [
-            _error(error["loc"], error["msg"], error["type"], error["input"])
-            for error in err.errors()
-            if error["loc"][:1] not in {(key,) for key in reasons}
-        ]
-    else:
-        if not errors:
-            return result
-    raise ValidationError.from_exception_data("", errors)
+        found = [(*reword(error), error["input"]) for error in err.errors()]
+        errors = [_error(way, text, kind, value) for kind, way, text, value in found]
+        raise ValidationError.from_exception_data("", errors) from None
+
+
+def _told(members: tuple[Any, ...], what: str, kind: str, key: str) -> str:
+    """Say what is wrong with a key that a kind needs, or does not have."""
+    here = f'kind = "{kind}"'
+    if what == "missing":
+        return f"is missing; {here} needs it"
+    keys = {member: list(signature(member).parameters) for member in members}
+    allowed = ", ".join(next(keys[m] for m in members if kind in _kinds_of(m)))
+    having = [f'"{k}"' for m in members if key in keys[m] for k in _kinds_of(m)]
+    if not having:
+        return f"unknown key; allowed with {here}: {allowed}"
+    others = " or ".join(having)
+    return f"has no meaning with {here}, which allows {allowed}; set kind to {others}"
+
+
+def _kinds_of(member: Any) -> tuple[str, ...]:
+    return get_args(get_type_hints(member, include_extras=True)["kind"])
 
 
 def _error(
@@ -218,22 +228,131 @@ def problems(err: ValidationError) -> Iterator[tuple[Location, str]]:
         if kind == "too_short" and location in lists:
             continue  # its only item is wrong, and told
         message = _WORDS.get(kind, error["msg"])
-        given = "" if kind in ("told", "missing") else f" (is {error['input']!r})"
-        keys = tuple(part for part in location if not str(part).startswith("("))
-        yield keys or location, message[0].lower() + message[1:] + given
+        given = (
+            ""
+            if kind in ("told", "unknown", "missing")
+            else f" (is {error['input']!r})"
+        )
+        yield location, message[0].lower() + message[1:] + given
 
 
-def _defaults(members: Iterable[type[Section]]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for member in members:
-        found = {**member.defaults(), **found}
-    return found
-
-
-def _either(values: Iterable[str | None]) -> str:
-    return " or ".join(f'"{value}"' for value in values if value)
+def _leaves(location: Location, value: Any) -> Iterator[tuple[Location, Any]]:
+    inner: list[tuple[str | int, Any]]
+    if isinstance(value, Section):
+        keys = type(value).model_fields.items()
+        inner = [(k, getattr(value, k)) for k, field in keys if not field.exclude]
+    elif is_dataclass(value) and hasattr(value, "kind"):
+        inner = list(vars(value).items())
+    elif isinstance(value, tuple) and value and isinstance(value[0], Section):
+        inner = list(enumerate(value))
+    else:
+        yield location, value
+        return
+    for key, item in inner:
+        yield from _leaves((*location, key), item)
 
 
 def _frozen(value: Any) -> Any:
     """Make tuples of lists, which strict models take."""
+    if isinstance(value, dict):
+        return {key: _frozen(item) for key, item in value.items()}
     return tuple(map(_frozen, value)) if isinstance(value, list) else value
+
+
+def tell(
+    path: str | Path,
+    text: str,
+    found: Iterable[tuple[Location, str]],
+    settings: Sequence[str] = (),
+) -> str:
+    """Tell problems of a file, each with its line and key; of many, the first.
+
+    Args:
+        path: the file.
+        text: its content, valid TOML.
+        found: keys that lead to each problem, and what is wrong.
+        settings: of the command line, see `overrides.set_keys`; a problem of one of
+            them is told with the setting in place of a line.
+    """
+    found, lines = list(found), []
+    for location, problem in found[:_MOST_PROBLEMS]:
+        if setting := find_setting(settings, location):
+            where = f"--set {setting}"
+        else:
+            line = _line_of(text, location)
+            where = f"{path}:{line}" if line else f"{path}"
+        key = ".".join(map(str, location))
+        lines.append(f"{where}: {key}: {problem}")
+    if more := len(found) - len(lines):
+        lines.append(f"{path}: and {more} more")
+    return "\n".join(lines)
+
+
+def _line_of(text: str, location: Location) -> int | None:
+    """Find the line of a key, or of the table that lacks it; 1-based.
+
+    Of a table without a header, such as dotted keys make, it is that of its first key.
+    """
+    document = tomlkit.parse(text)
+    item: Any = document
+    holder: Any = None
+    key: Any = None
+    for part in location:
+        inner = item.get(part) if isinstance(part, str) else item[part]
+        if inner is None:
+            break
+        holder, key, item = item, part, inner
+        if not isinstance(inner, Table | AoT | OutOfOrderTableProxy):
+            break  # a value, or an inline table
+    if holder is None:
+        return None
+    while isinstance(item, AoT | OutOfOrderTableProxy) or (
+        isinstance(item, Table) and item.is_super_table()
+    ):
+        holder, key = item, 0 if isinstance(item, AoT) else next(iter(item))
+        item = holder[key]
+    if isinstance(item, Table):
+        item.comment(_MARK)
+    else:
+        holder[key] = _MARK
+    return tomlkit.dumps(document).partition(_MARK)[0].count("\n") + 1
+
+
+class CameraSection(Section):
+    """The camera on the vehicle."""
+
+    width: Count = 200
+    height: Count = 66
+    fov_x_deg: Annotated[float, Field(gt=0, lt=180)] = 90.0
+    fx: Positive | None = None  # pixels; in place of fov_x_deg
+    fy: Positive | None = None  # fx
+    cx: Finite | None = None  # pixels from the image's corner, not its first pixel's
+    cy: Finite | None = None  # centre; the middle
+    k1: Finite = 0.0  # distortion as OpenCV's
+    k2: Finite = 0.0
+    p1: Finite = 0.0
+    p2: Finite = 0.0
+    height_m: Positive = 1.4
+    forward_m: Finite = 0.5
+    pitch_deg: Annotated[float, Field(gt=-90, lt=90)] = 6.0
+    lens: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+
+    def build(self) -> tuple[Camera, CameraMount]:
+        """Make intrinsics and mount."""
+        camera = from_fov(self.width, self.height, self.fov_x_deg)
+        lens = {k: getattr(self, k) for k in self.lens} | {"fy": self.fy or self.fx}
+        camera = replace(camera, **{k: v for k, v in lens.items() if v is not None})
+        return camera, CameraMount(self.height_m, self.forward_m, self.pitch_deg)
+
+    @model_validator(mode="after")
+    def _check_lens(self) -> Any:
+        """Refuse two focal lengths, half of one, and distortion without an inverse."""
+        if self.fx and self.fov_x_deg != self.defaults()["fov_x_deg"]:
+            refuse("fx", "stands beside fov_x_deg; give one of them")
+        if self.fy and not self.fx:
+            refuse("fy", "stands without fx; give both, or fov_x_deg")
+        try:
+            self.build()
+        except InputError as error:
+            refuse("k1", str(error))
+        return self

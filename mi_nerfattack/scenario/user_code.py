@@ -31,7 +31,7 @@ def check_trust(key: str, name: str, trusted: bool) -> None:
         raise InputError(
             f"{key}: {name}: is code and runs with all rights of your account; if you "
             f"trust who wrote it, say so: trust_code = true beside {key}, or "
-            "--trust-code on the command line"
+            f"--set {key.partition('.')[0]}.trust_code=true"
         )
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -11,27 +12,29 @@ import numpy as np
 
 from mi_nerfattack.attack.base import AbstractAttack
 from mi_nerfattack.deploy.environment import AbstractEnvironment
-from mi_nerfattack.deploy.kinematic import Motion
 from mi_nerfattack.deploy.place import Place
 from mi_nerfattack.deploy.registry import kinematic_vehicle
 from mi_nerfattack.deploy.surrogate.environment import SurrogateEnvironment
 from mi_nerfattack.deploy.surrogate.scene import field_sensor, scene_sensor, showing
+from mi_nerfattack.deploy.vehicle import Motion
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, load_field, load_grid
-from mi_nerfattack.fields.splats import read_splats
+from mi_nerfattack.fields.compact_splats import load_splats
+from mi_nerfattack.fields.io import holds_splats
+from mi_nerfattack.io.resumable import array_digest
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.render.backdrop import Layer
 from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.render.posed import PosedField, move_all, offsets_of
-from mi_nerfattack.render.splats import SplatBackground
+from mi_nerfattack.render.splatting.background import SplatBackground
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import ClosedLoop
 from mi_nerfattack.rollout.objective import AbstractObjective
 from mi_nerfattack.rollout.scene_sensor import SceneSensor
 from mi_nerfattack.rollout.sensor import AbstractSensor
+from mi_nerfattack.scenario.attack import Task
 from mi_nerfattack.scenario.deployment import SURROGATE, Deployment, deployments
-from mi_nerfattack.scenario.method import Task
 from mi_nerfattack.scenario.scenario import Scenario, SceneSection
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -48,6 +51,11 @@ class Appearance:
 
     textures: list[np.ndarray]
     offsets: np.ndarray
+
+    @cached_property
+    def digest(self) -> str:
+        """Tell it from others."""
+        return array_digest((*self.textures, self.offsets))
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,8 +307,8 @@ def build_rollout(world: World) -> tuple[Rollout, Any]:
         loop,
         world.objective,
         world.horizon,
-        scenario.objective.reduction.build(),
-        section.adjoint.build(),
+        scenario.objective.reduction,
+        section.adjoint,
         section.attached,
     )
     return rollout, loop.initial(optimised_states(scenario, world.route))
@@ -334,20 +342,15 @@ def load_posed(scene: SceneSection, path: Path) -> PosedField:
 
 
 def _load_layer(scenario: Scenario, path: Path) -> Layer:
-    """Load a scene: a field, or splats, which are told by the suffix .ply."""
-    if path.suffix.lower() != ".ply":
+    """Load a scene: a field, or splats, which are told by the suffix."""
+    if not holds_splats(path):
         posed = load_posed(scenario.scene, path)
         if scenario.attack.attached:
             posed.field.see_all()
         return posed
     if scenario.scene.step_m is not None:
         raise InputError(f"scene.step_m: {path} holds splats, which take no steps")
-    if scenario.attack.attached:
-        raise InputError(
-            f"{path}: splats have no derivative by the camera; set attack.attached to "
-            "false, or fit a field to the scene"
-        )
-    return SplatBackground(read_splats(path), scenario.scene.pose)
+    return SplatBackground(load_splats(path), scenario.scene.pose)
 
 
 def optimised_states(scenario: Scenario, route: Route) -> np.ndarray:
@@ -384,14 +387,3 @@ def initial_states(
         shifts[:] = factor @ rng.standard_normal((3, count))
     shifts[0] += section.start_m
     return route.pose_at(*shifts)
-
-
-def object_footprints(objects: Iterable[PosedField]) -> list[np.ndarray]:
-    """Return the outlines of the objects' boxes on the ground, (4, 2) metres each."""
-    outlines = []
-    for posed in objects:
-        low, high = posed.field.lower, posed.field.upper
-        x, y = (low[0], high[0], high[0], low[0]), (low[1], low[1], high[1], high[1])
-        corners = np.stack([x, y, np.zeros(4)], axis=1)
-        outlines.append(posed.placed.apply(corners)[:, :2])
-    return outlines

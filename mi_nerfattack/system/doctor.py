@@ -21,8 +21,8 @@ from mi_nerfattack import variant
 from mi_nerfattack.backend import llvm
 from mi_nerfattack.errors import NerfAttackError
 from mi_nerfattack.io import files
-from mi_nerfattack.system.cores import cores
 from mi_nerfattack.system.extras import install_hint
+from mi_nerfattack.system.machine import cores
 from mi_nerfattack.system.processes import module_command
 
 DISTRIBUTION = "mi-nerfattack"
@@ -164,7 +164,7 @@ def _llvm() -> Finding:
     where = f"{origins[library.origin]}, {library.path or 'file unknown'}"
     try:
         version = ".".join(map(str, llvm.check_version()))
-    except NerfAttackError as err:
+    except (NerfAttackError, ImportError) as err:
         return Finding("LLVM", where, "missing", str(err))
     return Finding("LLVM", f"{version} {where}")
 

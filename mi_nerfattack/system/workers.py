@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
+import sys
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -23,7 +24,7 @@ from mi_nerfattack.errors import (
     RefusedError,
     is_interrupt,
 )
-from mi_nerfattack.system.cores import cores
+from mi_nerfattack.system.machine import cores
 from mi_nerfattack.system.processes import blocked_interrupts, safe_path
 
 #: Most processes.
@@ -37,6 +38,23 @@ OnEnd = Callable[[int, Exception | None], None]
 #: What became of a piece, as one process tells another: "done"; "error" or "refused"
 #: and a message; or "bug" and a traceback.
 Told = tuple[str, str]
+
+
+def tally(progress: Callable[[int, int], None], done: int, total: int) -> OnUnits:
+    """Return what adds units of work to those that are done, and reports the sum.
+
+    Args:
+        progress: called with units done and wanted.
+        done: units, before.
+        total: units wanted.
+    """
+
+    def count(units: int) -> None:
+        nonlocal done
+        done += units
+        progress(done, total)
+
+    return count
 
 
 def raise_failure(piece: int, error: Exception | None) -> None:
@@ -199,7 +217,8 @@ class _Member:
         context = multiprocessing.get_context("spawn")  # Dr.Jit is not fork-safe
         self.connection, theirs = context.Pipe()
         self.piece, self.done = 0, 0
-        self._process = context.Process(target=_serve, args=(work, theirs), daemon=True)
+        about = work, theirs, _variant()
+        self._process = context.Process(target=_serve, args=about, daemon=True)
         with safe_path(), blocked_interrupts():
             self._process.start()
         theirs.close()  # so that its end is noticed
@@ -261,10 +280,26 @@ def available_cores() -> int:
     return min(cores(), MOST)
 
 
-def _serve(work: AbstractWork, connection: Connection) -> None:
-    """Do pieces until there are no more; runs in a process of its own."""
+def _variant() -> str | None:
+    """Return Mitsuba's active variant, without importing Mitsuba."""
+    mitsuba = sys.modules.get("mitsuba")
+    return None if mitsuba is None else mitsuba.variant()
+
+
+def _serve(work: AbstractWork, connection: Connection, variant: str | None) -> None:
+    """Do pieces until there are no more; runs in a process of its own.
+
+    Args:
+        work: whose pieces.
+        connection: to the process that hands them over.
+        variant: of Mitsuba, there.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the employer decides
     try:
+        if variant is not None:
+            import mitsuba
+
+            mitsuba.set_variant(variant)
         _use_one_thread()
         opened = None
         while (piece := connection.recv()) is not None:

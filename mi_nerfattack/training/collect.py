@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -12,12 +10,17 @@ from typing import Any
 import numpy as np
 
 from mi_nerfattack.backend.versions import versions
-from mi_nerfattack.deploy.environment import AbstractEnvironment
+from mi_nerfattack.deploy.environment import AbstractEnvironment, OpenEnvironment
 from mi_nerfattack.deploy.sites import AbstractSite, expert_of, probe_expert
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
-from mi_nerfattack.io.resumable import Record, Unit, flatten
-from mi_nerfattack.system.workers import AbstractWork, AbstractWorkers, OnUnits
+from mi_nerfattack.io.resumable import Record, Unit, flatten, json_digest
+from mi_nerfattack.system.workers import (
+    AbstractWork,
+    AbstractWorkers,
+    OnUnits,
+    tally,
+)
 from mi_nerfattack.training.dataset import shard_columns
 from mi_nerfattack.training.settings import CollectSettings
 from mi_nerfattack.training.sources import AbstractSource, Labelled, Scenery
@@ -93,12 +96,7 @@ def collect(
     done = settings.frames - sum(map(settings.size, missing))
     progress(done, settings.frames)
 
-    def count(frames: int) -> None:
-        nonlocal done
-        done += frames
-        progress(done, settings.frames)
-
-    workers.run(work, missing, count)
+    workers.run(work, missing, tally(progress, done, settings.frames))
     return paths
 
 
@@ -125,7 +123,7 @@ class _Shards(AbstractWork):
     def open(self) -> _Opened:
         """Load what staging and source need."""
         stage = self.staging.open(self.site, self.routes, self.settings)
-        return _Opened(self.site, stage, self.source.prepare())
+        return _Opened(stage, self.source.prepare())
 
     def do(self, opened: _Opened, index: int, report: OnUnits) -> None:
         """Render, label and write one shard."""
@@ -133,7 +131,9 @@ class _Shards(AbstractWork):
             [self.settings.seed, index, *self.site.name.encode()]
         )
         conditions = self.site.draw(rng)
-        environment = opened.environment(conditions)
+        environment = opened.environment.get(
+            conditions, lambda: self.site.open(conditions)
+        )
         opened.stage.begin(rng)
         opened.shown.clear()
         wanted, rows = self.settings.size(index), []
@@ -156,7 +156,7 @@ class _Shards(AbstractWork):
 
     def close(self, opened: _Opened) -> None:
         """Close the environment."""
-        opened.close()
+        opened.environment.close()
 
     def _rows(
         self,
@@ -180,36 +180,21 @@ class _Opened:
     """What a worker keeps from shard to shard: one environment, and a stage.
 
     Args:
-        site: see `collect`.
         stage: see `collect`.
         prepared: what the source needs.
 
     Attributes:
         shown: number of objects of each group of the shard.
+        environment: under the conditions of the shard.
     """
 
-    site: AbstractSite
     stage: AbstractStage
     prepared: Any
     shown: list[int] = field(default_factory=list)
-    _open: tuple[Any, AbstractEnvironment] | None = None
-
-    def environment(self, conditions: Any) -> AbstractEnvironment:
-        """Return the environment under conditions; it is loaded where they differ."""
-        if self._open is None or self._open[0] != conditions:
-            self.close()
-            self._open = conditions, self.site.open(conditions)
-        return self._open[1]
-
-    def close(self) -> None:
-        """Close the environment."""
-        if self._open is not None:
-            self._open[1].close()
-        self._open = None
+    environment: OpenEnvironment = field(default_factory=OpenEnvironment)
 
 
 def _counts(values: Any) -> dict[str, int]:
-    """Count equal integers."""
     names, counts = np.unique(values, return_counts=True)
     return {str(n): int(count) for n, count in zip(names, counts, strict=True)}
 
@@ -246,4 +231,4 @@ def _digest(routes: Sequence[Route]) -> str:
         [r.name, r.goal, r.lane_width_m, r.speed_ms, r.closed, r.points.tolist()]
         for r in routes
     ]
-    return hashlib.sha256(json.dumps(about).encode()).hexdigest()
+    return json_digest(about)

@@ -6,7 +6,6 @@ int64 (n,); `controls`, float32 (n,), rad/s or rad. Frames stay on the disk.
 
 from __future__ import annotations
 
-import hashlib
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ import numpy as np
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
+from mi_nerfattack.io.resumable import array_digest
 
 
 class FramesFile:
@@ -33,7 +33,9 @@ class FramesFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._start, dtype, self.shape = files.find_tensor(path, "frames")
+        with files.open_safetensors(path) as file:
+            frames = file.get_slice("frames")
+            dtype, self.shape = frames.get_dtype(), tuple(frames.get_shape())
         if dtype != "U8" or len(self.shape) != 4 or self.shape[3] != 3:
             raise InputError(
                 f"{path}: frames {dtype} {self.shape}; U8 of shape "
@@ -41,13 +43,15 @@ class FramesFile:
             )
 
     def __len__(self) -> int:
-        """Count the rows."""
         return self.shape[0]
 
     def __getitem__(self, rows: np.ndarray) -> np.ndarray:
         """Read rows (k,): (k, height, width, 3), as an array in memory gives them."""
         result = np.empty((len(rows), *self.shape[1:]), np.uint8)
-        files.read_rows(self.path, self._start, rows, result)
+        with files.open_safetensors(self.path) as file:
+            frames = file.get_slice("frames")
+            for i, row in enumerate(rows.tolist()):
+                result[i] = frames[row]
         return result
 
 
@@ -107,17 +111,13 @@ class FrameDataset:
         return cls(tuple(frames), np.concatenate(goals), np.concatenate(controls))
 
     def __len__(self) -> int:
-        """Count the rows."""
         return len(self.goals)
 
     @cached_property
     def digest(self) -> str:
         """Return the SHA-256 of frames, goals and controls; all of them are read."""
-        total = hashlib.sha256()
-        for array in (*self.frames, self.goals, self.controls):
-            total.update(str((array.shape, array.dtype)).encode())
-            total.update(array[np.arange(len(array))].reshape(-1).data)
-        return total.hexdigest()
+        columns = (*self.frames, self.goals, self.controls)
+        return array_digest(column[np.arange(len(column))] for column in columns)
 
     def read_frames(self, rows: np.ndarray) -> np.ndarray:
         """Copy frames (k, height, width, 3) uint8 of the given row numbers (k,)."""
@@ -214,7 +214,6 @@ def _draw_of(shard: Path) -> float:
 
 
 def _read_columns(shard: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read goals and controls."""
     columns, _ = files.read_safetensors(shard, ("goals", "controls"))
     goals, controls = columns["goals"], columns["controls"]
     if goals.dtype != np.int64 or controls.dtype != np.float32:

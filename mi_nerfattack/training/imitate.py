@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -100,25 +100,20 @@ def imitate(
         return run.run(module, more)
 
 
+@dataclass(eq=False)
 class _Imitation:
     """What the stages of one imitation share."""
 
-    def __init__(
-        self,
-        sites: Sequence[AbstractSite],
-        routes: Sequence[Route],
-        settings: ImitationSettings,
-        folder: Path,
-        workers: AbstractWorkers,
-        progress: OnStage,
-        staging: AbstractStaging,
-    ) -> None:
-        self.sites, self.routes, self.settings = sites, routes, settings
-        self.folder, self.workers, self.progress = folder, workers, progress
-        self.staging = staging
-        self.training: list[Path] = []
-        self.held_out: list[Path] = []
-        self._loop: ClosedLoop | None = None
+    sites: Sequence[AbstractSite]
+    routes: Sequence[Route]
+    settings: ImitationSettings
+    folder: Path
+    workers: AbstractWorkers
+    progress: OnStage
+    staging: AbstractStaging
+    training: list[Path] = field(default_factory=list)
+    held_out: list[Path] = field(default_factory=list)
+    _loop: ClosedLoop | None = None
 
     def run(self, module: PilotNet, more: Sequence[Path]) -> Imitated:
         """Do all stages, beginning with the weights of `module`."""
@@ -159,12 +154,11 @@ class _Imitation:
             site.load_surroundings() if wanted else None,
             self.settings.validation,
             self.settings.validate_every,
-            self._steps("validation"),
+            self._shown("validation"),
         )
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Close the environments."""
         for environment in self.loop.environments:
             environment.close()
 
@@ -192,7 +186,7 @@ class _Imitation:
                 seed=self._seed(number),
             )
             arguments = (settings, self.folder / name, self.workers)
-            show = self._frames(f"{name}, {site.name}")
+            show = self._shown(f"{name}, {site.name}", "{}/{} frames")
             shards += collect(site, self.routes, source, *arguments, show, self.staging)
         return shards
 
@@ -247,7 +241,7 @@ class _Imitation:
     def card(self, module: PilotNet) -> dict[str, Any]:
         """Drive a policy for its final figures, in the environments of validation."""
         final = replace(
-            self.loop, settings=self.settings.final, progress=self._steps("card")
+            self.loop, settings=self.settings.final, progress=self._shown("card")
         )
         return final.card(module)
 
@@ -256,14 +250,9 @@ class _Imitation:
         entropy = [self.settings.seed, number]
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
-    def _frames(self, stage: str) -> OnFrames:
+    def _shown(self, stage: str, words: str = "step {}/{}") -> OnFrames:
         return lambda done, total: self.progress(
-            stage, done, total, f"{done}/{total} frames"
-        )
-
-    def _steps(self, stage: str) -> Callable[[int, int], None]:
-        return lambda done, total: self.progress(
-            stage, done, total, f"step {done}/{total}"
+            stage, done, total, words.format(done, total)
         )
 
 
@@ -273,7 +262,6 @@ def _check(
     settings: ImitationSettings,
     more: Sequence[Path],
 ) -> None:
-    """Raise `InputError` for what cannot be trained."""
     names = [site.name for site in sites]
     if unknown := sorted(set(settings.sites) - set(names)):
         raise InputError(f"frames: of {', '.join(unknown)}; there is {names}")
@@ -338,7 +326,6 @@ def check_camera(site: AbstractSite) -> None:
 
 
 def _check_frames(module: PilotNet, shards: Sequence[Path]) -> None:
-    """Raise `InputError` unless a policy can be trained on shards."""
     for shard in shards:
         data = FrameDataset.from_shards([shard])
         height, width = data.frames[0].shape[1:3]
@@ -354,7 +341,6 @@ def _check_frames(module: PilotNet, shards: Sequence[Path]) -> None:
 
 
 def _take_weights(module: PilotNet, start: PilotNet) -> None:
-    """Copy weights from a policy for the same goals and controls."""
     mine, theirs = ((m.goals, m.max_control, m.unit) for m in (module, start))
     if mine != theirs:
         raise InputError(

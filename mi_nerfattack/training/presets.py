@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mi_nerfattack.deploy.car import SMALL_CAR
+from mi_nerfattack.deploy.place import Scatter
 from mi_nerfattack.deploy.roadside.rule import Roadside
-from mi_nerfattack.deploy.scatter import Scatter
 from mi_nerfattack.deploy.sites import ANY_WEATHER, Weather
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import EvaluateSettings

@@ -13,9 +13,9 @@ from pydantic import Field, ValidationError
 from mi_nerfattack.deploy.sites import AbstractSite
 from mi_nerfattack.io import files
 from mi_nerfattack.io.resumable import Record
-from mi_nerfattack.policy.exported.program import SUFFIX, export_program
+from mi_nerfattack.policy.exported import SUFFIX, export_program
 from mi_nerfattack.policy.pilotnet import PilotNet
-from mi_nerfattack.system.cores import machine
+from mi_nerfattack.system.machine import machine
 from mi_nerfattack.training.dataset import FramesFile
 from mi_nerfattack.training.imitate import Imitated
 from mi_nerfattack.training.settings import ImitationSettings

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from mi_nerfattack.deploy.place import Scatter
 from mi_nerfattack.deploy.roadside.rule import Roadside
-from mi_nerfattack.deploy.scatter import Scatter
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import EvaluateSettings
 from mi_nerfattack.ranges import Count, Fraction, Share, Whole, checked

@@ -44,7 +44,6 @@ class Scenery:
     def reset(self, pose: np.ndarray) -> np.ndarray:
         """Put the vehicle at a pose and return the image."""
         seed = int(self.rng.integers(2**31))
-        self.expert.reset()
         return self.environment.reset(self.route, pose, seed).image
 
     def label(self) -> float:

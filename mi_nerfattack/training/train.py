@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ import torch
 
 from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.io.resumable import Record, Unit, flatten
+from mi_nerfattack.io.resumable import Record, Unit, array_digest, flatten
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.ranges import Count, Fraction, checked
 from mi_nerfattack.training.augment import Augmentation
@@ -305,12 +304,7 @@ class _Run:
 
 
 def _digest_weights(module: PilotNet) -> str:
-    """Return the SHA-256 of a policy's weights."""
-    total = hashlib.sha256()
-    for name, value in module.state_dict().items():
-        total.update(name.encode())
-        total.update(value.cpu().contiguous().view(-1).numpy())
-    return total.hexdigest()
+    return array_digest(value.cpu().numpy() for value in module.state_dict().values())
 
 
 def check_labels(module: PilotNet, data: FrameDataset) -> None:

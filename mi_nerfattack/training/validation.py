@@ -15,6 +15,7 @@ from typing_extensions import TypedDict
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.roadside.surroundings import Surroundings
 from mi_nerfattack.evaluation.evaluate import EvaluateSettings, evaluate
+from mi_nerfattack.evaluation.metrics import cells
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.torch_policy import TorchPolicy
@@ -132,6 +133,9 @@ class ClosedLoop(AbstractValidation):
         }
 
 
+_CARD = "environment", "route", "case"
+
+
 def rank(row: Mapping[str, Any]) -> tuple[float, float, float]:
     """Return what is smaller for better epochs: drives departed, error in mm, loss."""
     error = round(row.get(ERROR, 0.0), 3)
@@ -141,18 +145,11 @@ def rank(row: Mapping[str, Any]) -> tuple[float, float, float]:
 def route_errors(card: Mapping[str, Any]) -> dict[str, float]:
     """Return mean cross-track errors, metres, by "ENVIRONMENT ROUTE CASE"."""
     return {
-        f"{environment} {route} {case}": figures["cross_track_mean_m"]
-        for environment, routes in card.items()
-        for route, cases in routes.items()
-        for case, figures in cases.items()
+        " ".join(case[name] for name in _CARD): case["cross_track_mean_m"]
+        for case in cells(card, *_CARD)
     }
 
 
 def count_departed(card: Mapping[str, Any]) -> int:
     """Return the number of drives of a card that left their lane."""
-    return sum(
-        figures["drives_departed"]
-        for routes in card.values()
-        for cases in routes.values()
-        for figures in cases.values()
-    )
+    return sum(case["drives_departed"] for case in cells(card, *_CARD))

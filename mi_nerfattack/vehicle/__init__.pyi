@@ -1,5 +1,5 @@
-from .ackermann_rate import RateLimitedAckermann as RateLimitedAckermann
 from .bicycle import KinematicBicycle as KinematicBicycle
+from .bicycle import RateLimitedAckermann as RateLimitedAckermann
 from .dynamics import AbstractDynamics as AbstractDynamics
 from .dynamics import Ackermann as Ackermann
 from .dynamics import Dubins as Dubins
@@ -10,6 +10,5 @@ from .integrators import ImplicitMidpoint as ImplicitMidpoint
 from .route.route import Route as Route
 from .route.route import load_routes as load_routes
 from .route.route import smooth_absolute as smooth_absolute
-from .route.torch_route import TorchRoute as TorchRoute
 from .torch_model import TorchDynamics as TorchDynamics
 from .user_model import FunctionDynamics as FunctionDynamics

@@ -8,15 +8,67 @@ Dr.Jit operations and therefore differentiable in forward and reverse mode.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
+from mi_nerfattack.backend.arrays import vjp
+from mi_nerfattack.backend.freeze import freeze_method
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Count, checked
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics
-from mi_nerfattack.vehicle.linear import solve_columns
+
+
+def solve_columns(columns: list[Any], right: Any) -> Any:
+    """Solve n systems of m equations by Gaussian elimination with row pivots.
+
+    Unrolled while it is traced: about `m^3` operations a system, meant for m below 10.
+
+    Args:
+        columns: m columns, each (m, n), of matrices that are not near singular.
+        right: (m, n).
+
+    Returns:
+        (m, n); differentiable in all arguments, in forward and reverse mode.
+    """
+    size = len(columns)
+    # Augmented rows; those above the diagonal are final.
+    rows = [[c[i] for c in columns] + [right[i]] for i in range(size)]
+    for k in range(size):
+        for i in range(k + 1, size):
+            rows[k], rows[i] = _larger_first(rows[k], rows[i], k)
+        for i in range(k + 1, size):
+            factor = rows[i][k] / rows[k][k]
+            for j in range(k + 1, size + 1):
+                rows[i][j] = rows[i][j] - factor * rows[k][j]
+    return type(right)(*_substitute(rows))
+
+
+def _larger_first(
+    first: list[Any], second: list[Any], k: int
+) -> tuple[list[Any], list[Any]]:
+    """Swap two rows where the second has the larger entry in column k."""
+    swap = dr.abs(second[k]) > dr.abs(first[k])
+    pairs = list(zip(first, second, strict=True))
+    done = first[:k]  # eliminated columns are never read again
+    return (
+        done + [dr.select(swap, b, a) for a, b in pairs[k:]],
+        done + [dr.select(swap, a, b) for a, b in pairs[k:]],
+    )
+
+
+def _substitute(rows: list[list[Any]]) -> list[Any]:
+    """Solve an upper triangular system, last row first."""
+    size = len(rows)
+    solution: list[Any] = [None] * size
+    for i in reversed(range(size)):
+        rest = rows[i][size]
+        for j in range(i + 1, size):
+            rest = rest - rows[i][j] * solution[j]
+        solution[i] = rest / rows[i][i]
+    return solution
 
 
 @dataclass(frozen=True)
@@ -37,11 +89,11 @@ class AbstractIntegrator(ABC):
             (m, n) state; derivatives with respect to `x` and `u` are tracked.
         """
 
-    @abstractmethod
     def residual(
         self, dynamics: AbstractDynamics, x_prev: Any, x: Any, u: Any, dt: float
     ) -> Any:
         """Evaluate G (m, n), in the state's units, zero where `x` is the step."""
+        return x - self.step(dynamics, x_prev, u, dt)
 
     def check(
         self, dynamics: AbstractDynamics, x_prev: Any, x: Any, u: Any, dt: float
@@ -63,12 +115,6 @@ class ExplicitEuler(AbstractIntegrator):
         """Advance (m, n) by dt seconds."""
         return x + dt * dynamics.derivative(x, u)
 
-    def residual(
-        self, dynamics: AbstractDynamics, x_prev: Any, x: Any, u: Any, dt: float
-    ) -> Any:
-        """Evaluate `x - step(x_prev)`."""
-        return x - self.step(dynamics, x_prev, u, dt)
-
 
 @dataclass(frozen=True)
 class RK4(AbstractIntegrator):
@@ -81,12 +127,6 @@ class RK4(AbstractIntegrator):
         k3 = dynamics.derivative(x + 0.5 * dt * k2, u)
         k4 = dynamics.derivative(x + dt * k3, u)
         return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-
-    def residual(
-        self, dynamics: AbstractDynamics, x_prev: Any, x: Any, u: Any, dt: float
-    ) -> Any:
-        """Evaluate `x - step(x_prev)`."""
-        return x - self.step(dynamics, x_prev, u, dt)
 
 
 @dataclass(frozen=True)
@@ -154,3 +194,101 @@ class ImplicitMidpoint(AbstractIntegrator):
             f"ImplicitMidpoint: residual {worst:.3g} after {self.iterations} Newton "
             f"iterations at dt = {dt!r} s; take a smaller dt or more iterations"
         )
+
+
+class Transition:
+    """The map ``x_t = Phi(x_{t-1}, u_{t-1-lag}, u_{t-2-lag})`` and its derivatives.
+
+    A control is held for one period (zero-order hold) and takes effect `delay`
+    integration steps after the image that it answers: with ``delay = lag substeps +
+    late``, the first `late` steps of a period still apply the older control. Before
+    the first control arrives the vehicle gets the control 0.
+
+    Args:
+        dynamics: the vehicle.
+        integrator: its time step.
+        period: seconds between two images.
+        substeps: integration steps a period, at least 1.
+        delay: integration steps, at least 0.
+
+    Raises:
+        ValueError: a count is out of range.
+    """
+
+    def __init__(
+        self,
+        dynamics: AbstractDynamics,
+        integrator: AbstractIntegrator,
+        period: float,
+        substeps: int = 1,
+        delay: int = 0,
+    ) -> None:
+        if substeps < 1:
+            raise ValueError(f"substeps: {substeps}; at least 1")
+        if delay < 0:
+            raise ValueError(f"delay: {delay}; at least 0 integration steps")
+        self.dynamics = dynamics
+        self.integrator = integrator
+        self.dt: float = period / substeps
+        self.substeps = substeps
+        self.lag: int = delay // substeps
+        self.late: int = delay % substeps
+        calls = (self._advance, self._vjp)
+        if dynamics.recordable:
+            calls = tuple(freeze_method(call, self._sizes) for call in calls)
+        self._advance_call, self._vjp_call = calls
+
+    def sources(self, period: int) -> tuple[int, int]:
+        """Return the indices of the older and the newer control of a period.
+
+        Negative indices stand for the control 0.
+        """
+        return period - self.lag - 1, period - self.lag
+
+    def controls(
+        self, controls: Sequence[Any], period: int, like: Any
+    ) -> tuple[Any, ...]:
+        """Pick the older and the newer control (n,) out of a drive's.
+
+        Args:
+            controls: raw controls of the periods 0 to `period`, rows (n,).
+            period: index.
+            like: any state of the drive.
+        """
+        none = dr.opaque(dr.detached_t(type(like[0])), 0, dr.width(like))
+        return tuple(controls[i] if i >= 0 else none for i in self.sources(period))
+
+    def advance(self, state: Any, older: Any, newer: Any) -> Any:
+        """Drive one period; (m, n), evaluated, detached.
+
+        Raises:
+            InputError: an implicit step did not converge.
+        """
+        path = self._advance_call(state, older, newer)
+        dr.eval(path)
+        for i, (before, after) in enumerate(zip(path[:-1], path[1:], strict=True)):
+            control = self.dynamics.saturate(older if i < self.late else newer)
+            self.integrator.check(self.dynamics, before, after, control, self.dt)
+        return path[-1]
+
+    def vjp(
+        self, state: Any, older: Any, newer: Any, cotangent: Any
+    ) -> tuple[Any, ...]:
+        """Multiply (m, n) by the derivatives: those by state, older, newer."""
+        result = self._vjp_call(state, older, newer, cotangent)
+        dr.eval(result)
+        return result
+
+    def _advance(self, state: Any, older: Any, newer: Any) -> list[Any]:
+        path = [state]
+        for i in range(self.substeps):
+            control = self.dynamics.saturate(older if i < self.late else newer)
+            path.append(self.integrator.step(self.dynamics, path[-1], control, self.dt))
+        return path
+
+    def _vjp(self, state: Any, older: Any, newer: Any, cotangent: Any) -> tuple:
+        return vjp(lambda x: self._advance(*x)[-1], (state, older, newer), cotangent)
+
+    def _sizes(self, *arguments: Any) -> list[int]:
+        """Return what a recording depends on beside the arguments: their sizes."""
+        return [dr.width(x) for x in arguments]

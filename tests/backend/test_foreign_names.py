@@ -34,13 +34,12 @@ DETAIL = {
     "drjit.detail.malloc_watermark",
     "mitsuba.detail.add_variant_callback",
 }
-PYTHON = {"_asdict", "_exit", "_replace"}  # documented under these names
+PYTHON = {"_exit"}  # documented under these names
 ROOTS = {"dr": dr, "drjit": dr, "mi": mi, "mitsuba": mi}
 
 
 @cache
 def nodes() -> list[tuple[Path, ast.AST]]:
-    """Return every node of the sources, and the file that it stands in."""
     folders = ("mi_nerfattack", "plugins", "scenes", "bench")
     return [
         (path.relative_to(ROOT), node)
@@ -51,7 +50,6 @@ def nodes() -> list[tuple[Path, ast.AST]]:
 
 
 def dotted(node: ast.AST) -> list[str]:
-    """Return the parts of `a.b.c`, and nothing of other expressions."""
     if isinstance(node, ast.Name):
         return [node.id]
     before = dotted(node.value) if isinstance(node, ast.Attribute) else []
@@ -86,14 +84,9 @@ def test_modules_of_details():
     assert {name for name in used if ".detail." in name} == DETAIL
 
 
-@pytest.mark.parametrize(("name", "owner"), PRIVATE.items())
-def test_private_name_is_there(name, owner):
-    assert hasattr(owner, name)
-
-
-@pytest.mark.parametrize(("name", "owner"), FIELDS.items())
-def test_field_is_there(name, owner):
-    assert name in owner.DRJIT_STRUCT
+def test_private_names_and_fields_are_there():
+    assert all(hasattr(owner, name) for name, owner in PRIVATE.items())
+    assert all(name in owner.DRJIT_STRUCT for name, owner in FIELDS.items())
 
 
 @pytest.mark.usefixtures("spectral")  # it has what RGB has

@@ -27,22 +27,20 @@ needs_package = pytest.mark.skipif(
 )
 
 
-def run_python(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
+def run_python(code: str, **variables: str) -> list[str]:
     """Run code in a process without LLVM or variant settings of this one."""
-    kept = {
-        name: value
-        for name, value in os.environ.items()
-        if name not in (llvm.VARIABLE, variant.VARIABLE)
-    }
-    return subprocess.run(
+    ours = (llvm.VARIABLE, variant.VARIABLE)
+    kept = {name: value for name, value in os.environ.items() if name not in ours}
+    done = subprocess.run(
         [sys.executable, "-c", code],
         env=kept | variables,
         capture_output=True,
         text=True,
         timeout=120,
-        check=False,
         cwd=ROOT,
     )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
 
 
 @pytest.fixture
@@ -52,13 +50,11 @@ def without_variable(monkeypatch):
 
 @needs_package
 def test_package_is_found_and_loaded_in_a_fresh_process():
-    done = run_python(
+    ensured, found, origin, major, *_ = run_python(
         "import mi_nerfattack, mi_nerfattack.backend.llvm as llvm, mitsuba as mi\n"
         "print(mi_nerfattack.backend.variant.ensure(), mi.variant())\n"
         "print(llvm.locate().origin, *llvm.check_version())"
     )
-    assert done.returncode == 0, done.stderr
-    ensured, found, origin, major, *_ = done.stdout.split()
     assert (ensured, found, origin) == ("llvm_ad_rgb", "llvm_ad_rgb", "package")
     assert 19 <= int(major) < 24
 
@@ -66,8 +62,7 @@ def test_package_is_found_and_loaded_in_a_fresh_process():
 @needs_package
 def test_package_library_is_the_real_file(without_variable):
     library = llvm.locate()
-    assert library.origin == "package"
-    assert library.path is not None
+    assert library.origin == "package" and library.path is not None
     assert library.path.is_file() and not library.path.is_symlink()
 
 
@@ -88,28 +83,23 @@ print(llvm.check_version()[0], os.environ[llvm.VARIABLE])
 
 
 @needs_package
-def test_mitsuba_may_be_imported_first():
-    done = run_python(ORDER.format(first=HOOK))
-    assert done.returncode == 0, done.stderr
-    major, path = done.stdout.split()
+@pytest.mark.parametrize("first", [HOOK, "os"])
+def test_mitsuba_may_be_imported_first(first):
+    """By the file's code, and by Python where the package is installed."""
+    installed = Path(sysconfig.get_path("purelib"), "mi_nerfattack_llvm.pth")
+    if first == "os" and not installed.is_file():
+        pytest.skip("installed before there was the file; install it again")
+    major, path = run_python(ORDER.format(first=first))
     assert int(major) >= 19 and str(llvm._find_in_package()) == path
 
 
-@needs_package
-def test_python_does_so_by_itself_where_the_package_is_installed():
-    if not Path(sysconfig.get_path("purelib"), "mi_nerfattack_llvm.pth").is_file():
-        pytest.skip("installed before there was the file; install it again")
-    done = run_python(ORDER.format(first="os"))
-    assert done.returncode == 0, done.stderr
-
-
 def test_the_user_s_variable_stays_when_mitsuba_is_imported_first():
-    done = run_python(
+    told = run_python(
         f"import {HOOK}\nimport drjit, os, sys\n"
         f"print(os.environ['{llvm.VARIABLE}'], 'mi_nerfattack' in sys.modules)",
         **{llvm.VARIABLE: "/nowhere/libLLVM.so"},
     )
-    assert done.stdout.split() == ["/nowhere/libLLVM.so", "False"], done.stderr
+    assert told == ["/nowhere/libLLVM.so", "False"]
 
 
 def test_users_variable_is_kept(monkeypatch):
@@ -119,14 +109,13 @@ def test_users_variable_is_kept(monkeypatch):
 
 
 def test_wrong_variable_is_named_and_not_replaced():
-    done = run_python(
+    told = run_python(
         "import mi_nerfattack\n"
         "try:\n    mi_nerfattack.backend.variant.ensure()\n"
         "except mi_nerfattack.SetupError as err:\n    print(err)",
         **{llvm.VARIABLE: "/nowhere/libLLVM.so"},
     )
-    assert done.returncode == 0, done.stderr
-    assert "cannot load /nowhere/libLLVM.so" in done.stdout
+    assert any(word.startswith("/nowhere/libLLVM.so") for word in told)
 
 
 def test_variable_is_left_alone_once_drjit_is_loaded(without_variable):
@@ -135,58 +124,51 @@ def test_variable_is_left_alone_once_drjit_is_loaded(without_variable):
     assert llvm.VARIABLE not in os.environ
 
 
-@pytest.mark.parametrize("found", [(14, 0, 6), (15, 0, 7), (16, 0, 0)])
-def test_old_version_is_refused(monkeypatch, found):
-    monkeypatch.setattr(dr.detail, "llvm_version", lambda: found)
-    with pytest.raises(SetupError, match=rf"LLVM {found[0]}\..*17 or newer"):
-        llvm.check_version()
-
-
-def test_missing_library_is_refused(monkeypatch, without_variable):
+@pytest.mark.parametrize(
+    ("found", "allowed"), [((-1, -1, -1), "install"), ((16, 0, 0), "LLVM 16.* 17 ")]
+)
+def test_missing_and_old_libraries_are_refused(
+    monkeypatch, without_variable, found, allowed
+):
     monkeypatch.setattr(llvm, "_find_in_package", lambda: None)
     monkeypatch.setattr(llvm, "_system_folders", lambda: [])
-    monkeypatch.setattr(dr.detail, "llvm_version", lambda: (-1, -1, -1))
-    with pytest.raises(SetupError, match="no LLVM library found; install one"):
+    monkeypatch.setattr(dr.detail, "llvm_version", lambda: found)
+    with pytest.raises(SetupError, match=allowed):
         llvm.check_version()
+    monkeypatch.setattr(dr.detail, "llvm_version", lambda: (17, 0, 0))
+    assert llvm.check_version() == (17, 0, 0)
 
 
 @needs_package
 def test_late_import_is_told_what_to_do(monkeypatch, without_variable):
     monkeypatch.setattr(dr.detail, "llvm_version", lambda: (15, 0, 7))
-    with pytest.raises(SetupError, match="import mi_nerfattack before drjit"):
+    with pytest.raises(SetupError) as refused:
         llvm.check_version()
+    assert "import mi_nerfattack before" in refused.value.remedy
 
 
-def test_version_17_is_accepted(monkeypatch):
-    monkeypatch.setattr(dr.detail, "llvm_version", lambda: (17, 0, 0))
-    assert llvm.check_version() == (17, 0, 0)
-
-
-def test_newest_system_library_is_taken(monkeypatch, tmp_path, without_variable):
-    for major in (14, 18, 19, 21):
-        folder = tmp_path / f"llvm-{major}" / "lib"
-        folder.mkdir(parents=True)
-        (folder / f"libLLVM-{major}.so.1").touch()
-    (tmp_path / "libLLVM.so").symlink_to(tmp_path / "llvm-14" / "lib")  # a folder
+def test_newest_system_library_of_19_or_more_is_taken(
+    monkeypatch, tmp_path, without_variable
+):
+    folders = [tmp_path]
     monkeypatch.setattr(llvm, "_find_in_package", lambda: None)
-    monkeypatch.setattr(
-        llvm, "_system_folders", lambda: [tmp_path, *tmp_path.glob("llvm-*/lib")]
-    )
-    newest = tmp_path / "llvm-21" / "lib" / "libLLVM-21.so.1"
-    assert llvm.locate() == llvm.Library(newest, "system")
-
-
-def test_old_system_library_is_not_taken(monkeypatch, tmp_path, without_variable):
-    (tmp_path / "libLLVM-18.so").touch()
-    monkeypatch.setattr(llvm, "_find_in_package", lambda: None)
-    monkeypatch.setattr(llvm, "_system_folders", lambda: [tmp_path])
-    assert llvm.locate() == llvm.Library(None, "dr.jit")
+    monkeypatch.setattr(llvm, "_system_folders", lambda: folders)
+    expected = {14: None, 18: None, 21: 21, 19: 21}
+    for major, newest in expected.items():
+        folders.append(tmp_path / f"llvm-{major}" / "lib")
+        folders[-1].mkdir(parents=True)
+        (folders[-1] / f"libLLVM-{major}.so.1").touch()
+        path = newest and tmp_path / f"llvm-{newest}/lib/libLLVM-{newest}.so.1"
+        found = llvm.Library(path, "system" if path else "dr.jit")
+        assert llvm.locate() == found
+    (tmp_path / "libLLVM.so").symlink_to(folders[-1])  # a folder
+    assert llvm.locate() == found
 
 
 @needs_package
 def test_runtime_is_loaded_where_the_links_are_missing(tmp_path):
     """Copy the package's libraries without its links, as before its first start."""
-    done = run_python(
+    path, *loaded = run_python(
         f"""
 import importlib.metadata, pathlib, shutil, sys
 top = pathlib.Path({str(tmp_path)!r})
@@ -217,33 +199,34 @@ maps = pathlib.Path("/proc/self/maps").read_text()
 print(str(top / "lib") in maps, "libc++.so.1.0" in maps)
 """
     )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[0].startswith(str(tmp_path))
-    assert done.stdout.splitlines()[1] == "True True"
+    assert path.startswith(str(tmp_path)) and loaded == ["True", "True"]
 
 
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("scalar_rgb", "no derivatives"),
+        ("scalar_rgb", "derivatives"),
         ("llvm_ad_mono_polarized", "polarised"),
-        ("metal_ad_rgb", "nobody has run the plugins on Metal"),
+        ("metal_ad_rgb", "Metal"),
     ],
 )
 def test_variants_that_the_plugins_do_not_run_in_are_refused(monkeypatch, name, reason):
     known = [*mi.variants(), "metal_ad_rgb"]  # which Mitsuba has on macOS
     monkeypatch.setattr(mi, "variants", lambda: known)
     monkeypatch.setattr(mi, "variant", lambda: name)
-    with pytest.raises(SetupError, match=f"{reason}.*llvm_ad_rgb"):
+    with pytest.raises(SetupError, match=reason) as refused:
         variant.ensure()
+    assert "llvm_ad_rgb" in refused.value.remedy
     assert name not in variant.usable()
 
 
 def test_unknown_variant_is_refused(monkeypatch):
-    monkeypatch.setattr(variant.mi, "variant", lambda: None)
+    monkeypatch.setattr(mi, "variant", lambda: None)
     monkeypatch.setenv(variant.VARIABLE, "llvm_rgb")
-    with pytest.raises(SetupError, match="unknown variant 'llvm_rgb'.*llvm_ad_rgb"):
+    with pytest.raises(SetupError, match="'llvm_rgb'") as refused:
         variant.ensure()
+    assert refused.value.where == variant.VARIABLE
+    assert "llvm_ad_rgb" in refused.value.remedy
 
 
 def test_variant_of_the_environment_is_set():
@@ -251,12 +234,12 @@ def test_variant_of_the_environment_is_set():
         "import mi_nerfattack, mitsuba as mi\n"
         "print(mi_nerfattack.backend.variant.ensure(), mi.variant())"
     )
-    done = run_python(code, **{variant.VARIABLE: "llvm_ad_mono"})
-    assert done.stdout.split() == ["llvm_ad_mono"] * 2
+    told = run_python(code, **{variant.VARIABLE: "llvm_ad_mono"})
+    assert told == ["llvm_ad_mono"] * 2
 
 
 def test_a_set_variant_is_kept(no_variant_left):
-    variant.mi.set_variant("llvm_ad_mono")
+    mi.set_variant("llvm_ad_mono")
     assert variant.ensure() == "llvm_ad_mono"
 
 
@@ -267,7 +250,7 @@ def test_failing_registration_does_not_stop_the_change(
         raise ValueError(f"broken plugin in {name}")
 
     monkeypatch.setattr(variant, "obstacle", fail)  # which the plugins ask first
-    variant.mi.set_variant("llvm_ad_mono")
-    variant.mi.set_variant("llvm_ad_rgb")
-    assert variant.mi.variant() == "llvm_ad_rgb"
+    mi.set_variant("llvm_ad_mono")
+    mi.set_variant("llvm_ad_rgb")
+    assert mi.variant() == "llvm_ad_rgb"
     assert "plugins not registered for llvm_ad_rgb" in caplog.text

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import shutil
 from pathlib import Path
 
@@ -21,25 +20,19 @@ def test_our_own_code_is_a_version(tmp_path):
     assert versions()["mi_nerfattack"] == mi_nerfattack.__version__
     there = tmp_path / "mi_nerfattack"
     shutil.copytree(PACKAGE, there, ignore=shutil.ignore_patterns("__pycache__"))
-    places = {"": there}
+    places = {"": there} | {name: there / name for name in ("plugins", "scenes")}
     for name in ("plugins", "scenes"):
-        places[name] = there / name
         shutil.copytree(PACKAGE.parent / name, there / name, dirs_exist_ok=True)
     assert versions()["source"] == digest_code(places)
     for name in ("plugins", "scenes", "rollout"):
-        with (there / name / "__init__.py").open("a") as file:
-            file.write("# changed\n")
+        file = there / name / "__init__.py"
+        text = file.read_text()
+        file.write_text(text + "# changed\n")
         assert versions()["source"] != digest_code(places)
-        shutil.copy(Path(find(name)), there / name / "__init__.py")
+        file.write_text(text)
     assert versions()["source"] == digest_code(places)
     with pytest.raises(SetupError, match="has no Python files"):
         digest_code({"": tmp_path / "none"})
-
-
-def find(name):
-    spec = importlib.util.find_spec(f"mi_nerfattack.{name}")
-    assert spec is not None and spec.origin is not None
-    return spec.origin
 
 
 def test_changed_code_is_another_version(tmp_path):
@@ -50,8 +43,9 @@ def test_changed_code_is_another_version(tmp_path):
     first = digest_code({"": tmp_path})
     (tmp_path / "report" / "a.py").write_text("colour = 2\n")
     assert digest_code({"": tmp_path}) == first
-    (tmp_path / "deploy" / "a.py").write_text("control = 0\n")
+    file = tmp_path / "deploy" / "a.py"
+    file.write_text("control = 0\n")
     assert digest_code({"": tmp_path}) != first
-    (tmp_path / "deploy" / "a.py").write_text("control = 1\n")
-    (tmp_path / "deploy" / "a.py").rename(tmp_path / "deploy" / "b.py")
+    file.write_text("control = 1\n")
+    file.rename(file.with_name("b.py"))
     assert digest_code({"": tmp_path}) != first

@@ -9,25 +9,16 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import torch
-from helpers.small_fields import blob, small_bricks, small_ngp
+from support.worlds.fields import blob, small_ngp
 
-from bench.full_ngp import NGPData, enlarge
-from bench.torch.bricks import TorchBricks
-from bench.torch.encoding import PlainHashGrid, TunedHashGrid
-from bench.torch.fit import BELOW_WHITE, Pictures, Plan, TorchFit
-from bench.torch.loop import (
-    Resized,
-    TorchCamera,
-    TorchLoop,
-    TorchRoute,
-    TorchVehicle,
-    TorchView,
-)
+from bench.ngp_data import NGPData
+from bench.torch.fit import BELOW_WHITE, Pictures, TorchFit
+from bench.torch.loop import TorchCamera, TorchLoop, TorchRoute, TorchVehicle, TorchView
 from bench.torch.ngp import TorchNGP
-from bench.torch.object import BagLookup, ObjectData, SelectLookup, TorchObject
+from bench.torch.object import ObjectData, TorchObject
 from mi_nerfattack.attack.objectives import CrossTrackDeviation
 from mi_nerfattack.deploy.surrogate.scene import field_sensor
-from mi_nerfattack.fields import NGPLayout, Occupancy, save_field
+from mi_nerfattack.fields import Occupancy
 from mi_nerfattack.fit.loss import huber
 from mi_nerfattack.policy.preprocess import Crop, Preprocess, Resize
 from mi_nerfattack.policy.torch_policy import TorchPolicy
@@ -46,7 +37,6 @@ from mi_nerfattack.vehicle.route.route import Route
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("variant")]
 STOP = 1e-3
-GRIDS = [PlainHashGrid, TunedHashGrid]
 IMAGES, PIXELS = 3, 40
 WIDTH, HEIGHT, HORIZON = 24, 14, 4
 CAMERA = from_fov(WIDTH, HEIGHT, 80.0)
@@ -99,44 +89,13 @@ def our_image(field, origin, direction):
     return (seen.total.radiance + (1 - seen.total.opacity) * behind).numpy().T
 
 
-@pytest.mark.parametrize("grid", GRIDS)
-def test_the_peer_sees_the_same_image(rng, data, grid):
+def test_the_peer_sees_the_same_image(rng, data):
     origin, direction = fan(rng)
     image = our_image(data.field(), origin, direction)
-    peer = TorchNGP(data, grid(data.layout), STOP)
+    peer = TorchNGP(data, STOP)
     found = peer.render(torch.tensor(origin), torch.tensor(direction)).numpy()
     assert image.std() > 0.05
     assert np.abs(found - image).max() < 1e-3
-
-
-def test_the_peer_sees_the_same_bricks(rng, tmp_path):
-    bricks = small_bricks(rng)
-    save_field(tmp_path / "b.safetensors", bricks)
-    origin, direction = fan(rng)
-    image = our_image(bricks, origin, direction)
-    peer = TorchBricks(tmp_path / "b.safetensors", STOP)
-    found = peer.render(torch.tensor(origin), torch.tensor(direction)).numpy()
-    assert image.std() > 0.05
-    assert np.abs(found - image).max() < 1e-3
-
-
-def test_both_encodings_agree_where_levels_are_hashed(rng):
-    layout = NGPLayout(6, 2, 9, 4, 64, 16)
-    plain, tuned = PlainHashGrid(layout), TunedHashGrid(layout)
-    assert 0 < plain.dense < layout.levels
-    table = torch.tensor(rng.normal(size=(plain.rows, 2)), dtype=torch.float32)
-    unit = torch.tensor(rng.random((50, 3)), dtype=torch.float32)
-    assert torch.allclose(plain(table, unit), tuned(table, unit), atol=1e-5)
-
-
-def test_an_enlarged_field_shows_the_same(rng, data):
-    full = NGPLayout(7, 2, 12, 4, 16, 32)
-    large = enlarge(data, full)
-    assert (large.layout.levels, large.layout.width) == (7, 32)
-    origin, direction = fan(rng)
-    small_image = our_image(data.field(), origin, direction)
-    large_image = our_image(large.field(), origin, direction)
-    assert np.abs(small_image - large_image).max() < 2e-3
 
 
 # The fit
@@ -144,7 +103,6 @@ def test_an_enlarged_field_shows_the_same(rng, data):
 
 @pytest.fixture
 def pictures(rng) -> Pictures:
-    """Return random pixels on random rays around the field."""
     direction = rng.normal(size=(IMAGES, PIXELS, 3))
     direction /= np.linalg.norm(direction, axis=2, keepdims=True)
     return Pictures(
@@ -160,11 +118,10 @@ def every_pixel(rng) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.arange(count), jitter
 
 
-@pytest.mark.parametrize("grid", GRIDS)
-def test_the_peer_has_the_gradients_of_our_renderer(rng, data, pictures, grid):
+def test_the_peer_has_the_gradients_of_our_renderer(rng, data, pictures):
     """Ours: the exact composite, which no fit uses, and its replayed derivative."""
     index, jitter = every_pixel(rng)
-    fit = TorchFit(data, grid(data.layout), pictures, len(index))
+    fit = TorchFit(data, pictures, len(index))
     loss = fit.gradients(index, jitter)
 
     field = data.field()
@@ -205,28 +162,23 @@ def test_the_peer_has_the_gradients_of_our_renderer(rng, data, pictures, grid):
         assert np.linalg.norm(np.concatenate(parts)) == pytest.approx(packed, rel=1e-2)
 
 
-@pytest.mark.parametrize("grid", GRIDS)
-def test_gradients_do_not_depend_on_the_plan(rng, data, pictures, grid):
+def test_gradients_do_not_depend_on_the_chunk(rng, data, pictures):
     index, jitter = every_pixel(rng)
-    fit = TorchFit(data, grid(data.layout), pictures, len(index))
+    fit = TorchFit(data, pictures, len(index))
     results = []
-    for plan in Plan.candidates(len(index)):
-        fit.plan = plan
+    for fit.chunk in (len(index), 30):
         loss = fit.gradients(index, jitter)
         results.append((loss, [leaf.grad.clone() for leaf in fit.leaves]))
-    assert len(results) > 2
-    for loss, gradients in results[1:]:
-        assert loss == pytest.approx(results[0][0], rel=1e-4)
-        for found, expected in zip(gradients, results[0][1], strict=True):
-            assert (found - expected).norm() < 1e-3 * expected.norm()
+    (loss, gradients), (other, expected) = results
+    assert loss == pytest.approx(other, rel=1e-4)
+    for found, one in zip(gradients, expected, strict=True):
+        assert (found - one).norm() < 1e-3 * one.norm()
 
 
 # The closed loop
 
 
 class Gain(torch.nn.Module):
-    """A smooth functional of the image."""
-
     goals = 1
 
     def __init__(self) -> None:
@@ -248,19 +200,16 @@ def scene() -> NGPData:
     return replace(data, lower=-corner, upper=corner, step_m=0.4)
 
 
-def peer(scene: NGPData, item: ObjectData, grid=TunedHashGrid, lookup=None):
-    seen = TorchObject(item, lookup or BagLookup(), STOP)
+def peer(scene: NGPData, item: ObjectData):
+    seen = TorchObject(item, STOP)
     seen.texture.requires_grad_(True)
-    ngp = TorchNGP(scene, grid(scene.layout), STOP)
+    ngp = TorchNGP(scene, STOP)
     view = TorchView(ngp, seen, TorchCamera(CAMERA, MOUNT), 100)
     vehicle, route = TorchVehicle(5.0, 1.5, 0.1), TorchRoute(ROUTE.points, 0.05)
-    return TorchLoop(view, Resized(Gain(), STAGES), 0, vehicle, route)
+    return TorchLoop(view, Gain(), STAGES, 0, vehicle, route)
 
 
-@pytest.mark.parametrize(
-    ("grid", "lookup"), [(PlainHashGrid, BagLookup()), (TunedHashGrid, SelectLookup())]
-)
-def test_the_peer_drives_and_differentiates_as_we_do(rng, scene, grid, lookup):
+def test_the_peer_drives_and_differentiates_as_we_do(rng, scene):
     item = PosedField(blob(rng, peak=4.0), POSE)
     sensor = field_sensor(PosedField(scene.field()), [item], CAMERA, MOUNT, stop=STOP)
     policy = TorchPolicy(Gain(), preprocess=Preprocess(STAGES))
@@ -269,7 +218,7 @@ def test_the_peer_drives_and_differentiates_as_we_do(rng, scene, grid, lookup):
     evaluation = rollout.run(loop.initial(INITIAL))
     expected = rollout.gradient(evaluation).textures[0].numpy()
 
-    other = peer(scene, ObjectData.of(item), grid, lookup)
+    other = peer(scene, ObjectData.of(item))
     states = other.drive(torch.tensor(INITIAL), HORIZON)
     cost = other.objective(states)
     cost.backward()

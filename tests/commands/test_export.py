@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 import trimesh
-from helpers.mesh_samples import CORNERS, four_colours
-from helpers.small_fields import small_ngp, vertices
 from PIL import Image
+from support.files.objects import CORNERS, four_colours
+from support.worlds.fields import vertices
 
 from mi_nerfattack import cli
 from mi_nerfattack.backend.colour import srgb_to_linear_numpy
@@ -59,6 +59,12 @@ def error_of(mesh) -> np.ndarray:
     """Return how far colours are from what was painted, sRGB, (n,)."""
     expected = srgb_to_linear_numpy(painted(mesh.vertices))
     return np.abs(mesh.colours - expected).max(1)
+
+
+def provenance(low: np.ndarray, high: np.ndarray) -> dict[str, str]:
+    """Tell the object's box, as fits do."""
+    corners = {"lower": low, "upper": high}.items()
+    return {f"provenance.object_{k}": " ".join(map(str, v)) for k, v in corners}
 
 
 class TestFieldSurface:
@@ -133,24 +139,18 @@ class TestPaintedMesh:
         assert area == pytest.approx(source.area)
         assert error_of(mesh).mean() < 0.02 and error_of(mesh).max() < 0.08
 
-    @pytest.mark.parametrize("scale", [0.5, 0.9, 1.1])
-    def test_another_size(self, scale):
-        """As with --longest-m forgotten: smaller than the object, or larger."""
+    def test_another_size_or_mesh(self):
+        """As with --longest-m forgotten: smaller than the object, larger, elsewhere."""
         source = self.cube()
-        corners = zip(("lower", "upper"), source.bounds, strict=True)
-        info = {
-            f"provenance.object_{name}": " ".join(map(str, corner))
-            for name, corner in corners
-        }
-        field = solid_field(block, info=info)
-        assert len(painted_mesh(field, source).faces) > 100
-        with pytest.raises(InputError, match=r"block: reaches from .* object from"):
-            painted_mesh(field, source.transformed(scale, np.zeros(3)))
-
-    def test_another_mesh(self):
-        moved = self.cube().transformed(1.0, np.array([3.0, 0, 0]))
-        with pytest.raises(InputError, match="block: reaches from"):
-            painted_mesh(solid_field(block), moved)
+        info = provenance(*source.bounds)
+        assert len(painted_mesh(solid_field(block, info=info), source).faces) > 100
+        for scale, x, field in (
+            (0.5, 0.0, solid_field(block, info=info)),
+            (1.1, 0.0, solid_field(block, info=info)),
+            (1.0, 3.0, solid_field(block)),
+        ):
+            with pytest.raises(InputError, match=r"block: reaches from"):
+                painted_mesh(field, source.transformed(scale, np.array([x, 0, 0])))
 
 
 def test_glb_is_read_back_as_it_was(tmp_path):
@@ -174,11 +174,7 @@ class TestFaces:
     def test_what_each_side_shows(self):
         """Colours follow the place; each picture lies as its table says."""
         low, high = np.array([-0.5, -0.4, 0.2]), np.array([0.5, 0.4, 1.4])
-        info = {
-            "provenance.object_lower": " ".join(map(str, low)),
-            "provenance.object_upper": " ".join(map(str, high)),
-        }
-        faces = render_faces(solid_field(block, info=info), 50.0)
+        faces = render_faces(solid_field(block, info=provenance(low, high)), 50.0)
         for name, (normal, right, up) in meshes.CUBE_FACES.items():
             normal, right, up = (np.array(axis) for axis in (normal, right, up))
             image = faces.images[name]
@@ -221,62 +217,18 @@ class TestFaces:
             render_faces(solid_field(block), scale)
 
 
-class TestCommand:
-    """`mi-nerfattack export`: one line of error, code 2, and nothing written."""
-
-    def call(self, capsys, *arguments) -> tuple[int, str, str]:
-        code = cli.main(["export", *map(str, arguments)])
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    def test_both_kinds(self, tmp_path, capsys):
-        save_field(tmp_path / "a.safetensors", solid_field(block))
-        glb = tmp_path / "a.glb"
-        code, out, _ = self.call(capsys, tmp_path / "a.safetensors", "-o", glb)
-        assert code == 0 and "triangles" in out
-        bounds = load_mesh(glb).bounds
-        wanted = [[-0.5, -0.4, 0.2], [0.5, 0.4, 1.4]]
-        np.testing.assert_allclose(bounds, wanted, atol=0.05)
-        words = tmp_path / "a.safetensors", "-o", tmp_path / "b"
-        code, out, _ = self.call(capsys, *words)
-        assert code == 0 and "2.000 x 1.600 x 1.600 m" in out
-        code, out, _ = self.call(capsys, *words, "--json")
-        assert code == 0 and json.loads(out)["size_m"] == pytest.approx([2, 1.6, 1.6])
-        names = {f"{name}.png" for name in meshes.CUBE_FACES} | {"faces.json"}
-        assert {path.name for path in (tmp_path / "b").iterdir()} == names
-
-    def test_refused(self, tmp_path, capsys):
-        good = tmp_path / "good.safetensors"
-        save_field(good, solid_field(block))
-        save_field(tmp_path / "ngp.safetensors", small_ngp())
-        (tmp_path / "zip.safetensors").write_bytes(b"PK\3\4" + b"\0" * 100)
-        (tmp_path / "pickle.safetensors").write_bytes(b"\x80\4\x95" + b"\0" * 100)
-        (tmp_path / "cut.safetensors").write_bytes(good.read_bytes()[:5000])
-        (tmp_path / "file").write_text("")
-        out = tmp_path / "out.glb"
-        before = set(tmp_path.iterdir())
-        for arguments, message in (
-            (("none.safetensors", "-o", out), "none.safetensors: does not exist"),
-            ((tmp_path / "ngp.safetensors", "-o", out), "is a ngp_field; a grid_field"),
-            ((tmp_path / "zip.safetensors", "-o", out), "is a zip archive"),
-            ((tmp_path / "pickle.safetensors", "-o", out), "is a pickle"),
-            ((tmp_path / "cut.safetensors", "-o", out), "cut.safetensors: "),
-            ((good, "-o", tmp_path / "out.obj"), "give FILE.glb or a"),
-            ((good, "-o", tmp_path / "file"), "is a file; give a folder"),
-            ((good, "-o", tmp_path / "no" / "a.glb"), "does not exist"),
-            ((good, "-o", out, "--height-m", 1), "--height-m: needs --mesh"),
-            ((good, "-o", out, "--pixels-per-m", 9), "--pixels-per-m: is for pictures"),
-            (
-                (good, "-o", tmp_path / "f", "--mesh", "a.glb"),
-                "--mesh: is for FILE.glb",
-            ),
-            ((good, "-o", good), "give FILE.glb or a folder's name"),
-            ((good, "-o", out, "--mesh", tmp_path / "none.glb"), "none.glb: does not"),
-        ):
-            code, shown, error = self.call(capsys, *arguments)
-            assert (code, shown) == (2, ""), error
-            assert message in error and error.count("\n") == 1, error
-            assert set(tmp_path.iterdir()) == before
+def test_the_command_writes_both_kinds(tmp_path, capsys):
+    field, glb, faces = (tmp_path / name for name in ("a.safetensors", "a.glb", "b"))
+    save_field(field, solid_field(block))
+    assert cli.main(["export", "mesh", str(field), "-o", str(glb)]) == 0
+    wanted = [[-0.5, -0.4, 0.2], [0.5, 0.4, 1.4]]
+    np.testing.assert_allclose(load_mesh(glb).bounds, wanted, atol=0.05)
+    capsys.readouterr()
+    assert cli.main(["export", "faces", str(field), "-o", str(faces), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["size_m"] == pytest.approx([2, 1.6, 1.6])
+    names = {f"{name}.png" for name in meshes.CUBE_FACES} | {"faces.json"}
+    assert {path.name for path in faces.iterdir()} == names
 
 
 def test_cube_reads_its_pictures(tmp_path):
@@ -291,5 +243,3 @@ def test_cube_reads_its_pictures(tmp_path):
     (tmp_path / "nz.png").unlink()
     with pytest.raises(InputError, match=r"nz\.png: does not exist"):
         Placement().cube(1.0, tmp_path)
-    with pytest.raises(InputError, match="--edge-m: is missing"):
-        Placement().cube(None, None)

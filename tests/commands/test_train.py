@@ -1,55 +1,185 @@
-"""The command that trains: what it refuses, and what it says."""
+"""The commands that train and retrain: what they make, count and refuse."""
 
 from __future__ import annotations
 
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import mitsuba as mi
 import pytest
 
 from mi_nerfattack import cli
 from mi_nerfattack.commands.train import Train
 from mi_nerfattack.deploy.place import bundled_place
+from mi_nerfattack.experiment.retrain.solvable import drive_expert
+from mi_nerfattack.experiment.transfer.found import read_found
 from mi_nerfattack.io import files
+from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.rollout.drive import departure_limit
-from mi_nerfattack.scenes import bundled
 from mi_nerfattack.training.presets import find_preset
 from mi_nerfattack.vehicle.route.route import load_routes
-
-SCENE, ROUTES = (str(bundled(f"room/{name}")) for name in ("scene.xml", "routes.json"))
+from tests.faults import worlds
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 
-def run_train(tmp_path, *arguments: str) -> int:
-    base = ["train", "-o", str(tmp_path / "policy.safetensors")]
-    return cli.main([*base, "--data", str(tmp_path / "data"), *arguments])
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """The folder of a finished attack on PilotNet, without pictures."""
+    mi.set_variant("llvm_ad_rgb")
+    folder = tmp_path_factory.mktemp("scenario")
+    worlds.pilotnet(folder)
+    return folder / "run"
+
+
+def changed(run: Path, folder: Path, *changes: tuple[str, str]) -> Path:
+    """Copy a run, with a changed scenario that no checkpoint contradicts."""
+    shutil.copytree(run, folder)
+    (folder / "checkpoint.safetensors").unlink()
+    path = folder / "scenario.toml"
+    text = path.read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path.write_text(text)
+    return folder
+
+
+def retrain(folder: Path, *arguments: object) -> int:
+    words = ["retrain", "-o", folder / "new.safetensors", "--data", folder / "data"]
+    words += ["--workers", 1, "--epochs", 1, "--card-runs", 1, "--runs", 1]
+    words += [*arguments, "--environments", "surrogate"]
+    return cli.main([str(word) for word in words])
+
+
+def test_a_policy_is_tuned_on_old_and_new_frames(run, tmp_path, capsys):
+    """A scenario with a blocked lane does not count."""
+    blocked = changed(run, tmp_path / "blocked", ("-13.0, 3.4", "-13.0, 0.4"))
+    frames = ["--frames", "surrogate", 64, "--exposures-ev", 0]
+    assert retrain(tmp_path, run, blocked, *frames, "--json") == 0
+    told, err = capsys.readouterr()
+    assert "blocked: left out: an object stands" in err and "no --more" in err
+    old = PilotNet.load(run.parent / "policy.safetensors")
+    new = PilotNet.load(tmp_path / "new.safetensors")
+    assert (new.goals, new.max_control) == (old.goals, old.max_control)
+    pairs = zip(new.parameters(), old.parameters(), strict=True)
+    steps = [float((a - b).abs().max().detach()) for a, b in pairs]
+    assert 0 < max(steps) < 0.01  # a training of its own would be far away
+    about = files.read_json(tmp_path / "new-retrain.json")
+    assert json.loads(told).items() >= about.items()
+    assert [item["label"] for item in about["runs"]] == ["run"]
+    assert list(about["left_out"]) == ["blocked"]
+    assert about["policy"]["sha256"] == files.sha256(run.parent / "policy.safetensors")
+    record = files.read_json(tmp_path / "new.json")
+    assert record["data"] == {"round_0/surrogate": 64}
+    # other runs are other frames
+    near = changed(run, tmp_path / "near", ("-13.0, 3.4", "-12.0, 3.4"))
+    assert retrain(tmp_path, run, near, *frames) == 2
+    assert "staging.found" in capsys.readouterr().err
+    # old frames are trained on, too, and attacks driven that nothing was trained on
+    other = tmp_path / "other"
+    other.mkdir()
+    more = ["--more", tmp_path / "data", "--held-out", run]
+    assert retrain(other, near, *frames, *more) == 0
+    check_table(files.read_json(other / "new-retrain.json"), other)
+    record = files.read_json(other / "new.json")
+    assert record["data"] == {"round_0/surrogate": 64, "earlier/surrogate": 64}
+    check_adaptive(other, near, *frames, *more)
+    page = other / "page.html"
+    words = ["report", str(other / "new-retrain.json"), "-o", str(page), "--json"]
+    assert cli.main(words) == 0
+    assert "Adaptive" in page.read_text()
+
+
+def check_adaptive(folder: Path, run: Path, *arguments) -> None:
+    """The new policy is attacked later, and not trained again."""
+    weights = (folder / "new.safetensors").read_bytes()
+    assert retrain(folder, run, *arguments, "--adaptive") == 0
+    about = files.read_json(folder / "new-retrain.json")
+    assert (folder / "new.safetensors").read_bytes() == weights
+    check_table(about, folder, "adaptive")
+    (cell,) = (folder / "data" / "adaptive" / "cells").iterdir()
+    assert (cell / "_complete").exists()
+    (found,), (old,) = read_found([cell]), read_found([run])
+    assert found.scenario.policy.file.file == folder / "new.safetensors"
+    same = {"policy": old.scenario.policy}
+    assert found.scenario.model_copy(update=same).digest() == old.scenario.digest()
+    (anew,) = about["adaptive"]
+    assert anew["label"] == cell.name and anew["found_sha256"] == found.digest
+    made = cell.stat().st_mtime_ns
+    assert retrain(folder, run, *arguments, "--adaptive") == 0
+    assert cell.stat().st_mtime_ns == made
+    assert files.read_json(folder / "new-retrain.json") == about
+
+
+def check_table(about: dict, folder: Path, *more: str) -> None:
+    """Before and after are the drives of a transfer of each group by each policy."""
+    rows = about["table"]
+    assert [row["group"] for row in rows] == ["old", "held_out", *more]
+    assert [item["label"] for item in about["held_out"]] == ["run"]
+    for row in rows:
+        for stage in ("before", "after"):
+            is_later = row["group"] == "adaptive" and stage == "before"
+            group = "old" if is_later else row["group"]
+            kept = folder / "data" / f"{group}_{stage}" / "transfer.json"
+            (column,) = files.read_json(kept)["columns"]
+            assert row[stage] == column["cases"]
+            assert row[stage]["attack"]["drives"] == 1
+            clean, attacked = (
+                row[stage][case]["cross_track_mean_m"]
+                for case in ("no_object", "attack")
+            )
+            assert row["attack_to_clean"][stage] == pytest.approx(attacked / clean)
+        before, after = (row[s]["no_object"] for s in ("before", "after"))
+        assert before["cross_track_mean_m"] != after["cross_track_mean_m"]
+        ratio = after["cross_track_mean_m"] / before["cross_track_mean_m"]
+        assert row["clean_ratio"] == pytest.approx(ratio)
+
+
+def test_the_expert_decides_what_can_be_driven(run, tmp_path):
+    (found,) = read_found([run])
+    driven = drive_expert(found)
+    assert driven.trouble == ""
+    # a box 3 m wide around y = 3.4 m, and a car 1.8 m wide within 0.3 m of y = 0
+    assert driven.gap_m == pytest.approx(3.4 - 1.5 - 0.9, abs=0.3)
+    late = changed(run, tmp_path / "late", ("[drive]", "[drive]\nlateral_sd_m = 5.0"))
+    (found,) = read_found([late])
+    assert "leaves its lane" in drive_expert(found).trouble
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("change", "message"),
     [
-        (["--preset", "desktop"], "preset: 'desktop'; one of laptop"),
-        (["--frames", "moon", "3"], "environment: 'moon'; one of surrogate"),
-        (["--scene", SCENE, "--routes", ROUTES], "no field; make one with"),
-        (["--skies", "dusk"], "sky: 'dusk'"),
-        (["--more", "{empty}"], "no frames in it"),
-        (["--workers", "0"], "workers: 0"),
-        (["--validate-every", "0"], "validate_every: 0;"),
-        (["--preset", "intersection", "--dagger-rounds", "2"], "without dagger_frames"),
-        (["--scene", "mine.xml"], "--scene: mine.xml; it needs its --routes"),
-        (["--frames", "carla", "64"], "drive in CARLA with 'mi-nerfattack evaluate'"),
-        (["--validate-in", "carla"], "environment: 'carla'; a server answers to one"),
-        (["--frames", "replay", "64"], "a recording does not answer to a policy"),
+        (("[policy]", "[policy]\ncontrol_scale = 0.5"), "only PilotNet of"),
+        (("policy.safetensors", "other.safetensors"), "retrain one policy at a time"),
+        (("[drive]", "[vehicle]\nwidth_m = 1.5\n[drive]"), "one place at a time"),
     ],
 )
-def test_train_says_what_is_wrong(tmp_path, capsys, arguments, message):
-    (tmp_path / "empty").mkdir()
-    filled = [item.format(empty=tmp_path / "empty") for item in arguments]
-    assert run_train(tmp_path, *filled) == 2
-    captured = capsys.readouterr().err
-    assert message in captured and captured.count("\n") == 1
-    assert not (tmp_path / "policy.safetensors").exists()
+def test_runs_that_do_not_go_together_are_refused(
+    run, tmp_path, change, message, capsys
+):
+    PilotNet(4).save(run.parent / "other.safetensors")
+    other = changed(run, tmp_path / "other", change)
+    assert retrain(tmp_path, run, other) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "data").exists()
+
+
+def test_options_that_do_not_fit_are_told(run, tmp_path, capsys):
+    assert retrain(tmp_path, run, "--frames", "carla", 8) == 2
+    assert "--frames: 'carla'; of surrogate" in capsys.readouterr().err
+    assert retrain(tmp_path, run, "--held-out", run) == 2
+    assert "each once" in capsys.readouterr().err
+    policy = run.parent / "policy.safetensors"
+    before = policy.read_bytes()
+    assert retrain(tmp_path, run, "-o", policy) == 2
+    assert "is the policy that was attacked" in capsys.readouterr().err
+    assert policy.read_bytes() == before
+    blocked = changed(run, tmp_path / "blocked", ("-13.0, 3.4", "-13.0, 0.4"))
+    assert retrain(tmp_path, blocked) == 2
+    assert "none can be driven by the expert" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["policy.safetensors", "policy.pt2", "policy.json"])
@@ -58,7 +188,8 @@ def test_what_cannot_be_written_is_told_before_the_first_frame(tmp_path, capsys,
         (tmp_path / name).symlink_to(tmp_path / "nowhere" / name)
     else:
         (tmp_path / name).mkdir()
-    assert run_train(tmp_path, "--frames", "moon", "1") == 2
+    words = ["train", "-o", tmp_path / "policy.safetensors", "--data", tmp_path / "a"]
+    assert cli.main([*map(str, words), "--frames", "moon", "1"]) == 2
     assert str(tmp_path / name) in capsys.readouterr().err
 
 
@@ -76,15 +207,3 @@ def test_a_rooms_policy_is_validated_within_its_lane():
     for chosen in (settings.validation, settings.final):
         assert departure_limit(route.lane_width_m, chosen.car_width_m) > 0.15
     assert settings.final.seed != settings.validation.seed
-
-
-def test_train_names_a_missing_scene(tmp_path, capsys):
-    routes = {"goal": 0, "lane_width_m": 3.5, "speed_ms": 5.0}
-    routes["points_m"] = [[0, 0], [40, 0]]
-    files.write_json(tmp_path / "routes.json", {"straight": routes})
-    missing = str(tmp_path / "nowhere.xml")
-    arguments = ["--scene", missing, "--field", missing, "--object", missing]
-    arguments += ["--routes", str(tmp_path / "routes.json")]
-    assert run_train(tmp_path, *arguments) == 2
-    assert f"{missing}: does not exist" in capsys.readouterr().err
-    assert not (tmp_path / "policy.safetensors").exists()

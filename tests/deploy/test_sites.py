@@ -6,86 +6,80 @@ import importlib.metadata
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
-from helpers.tiny_place import SCENE, write_place
+from support.faults.refusals import refusals
+from support.worlds.places import SCENE, straight, write_place
 
+from mi_nerfattack.deploy.place import Scatter
 from mi_nerfattack.deploy.sites import PlaceSite
 from mi_nerfattack.render.camera.pose import Pose
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-MESH = '<shape type="ply"><string name="filename" value="block.ply"/></shape>'
+MESH = """<shape type="ply" id="{0}">
+<string name="filename" value="{0}/meshes/block.ply"/></shape>"""
 
 
-def test_a_mesh_beside_the_scene_decides_about_the_frames(tmp_path):
-    place = write_place(tmp_path)
-    place.scene.write_text(SCENE.replace("</scene>", MESH + "</scene>"))
+def test_meshes_beside_the_scene_decide_about_the_frames(tmp_path):
+    place, shapes = write_place(tmp_path), ""
+    for folder in "ab":  # of equal names in folders of equal names
+        path = tmp_path / folder / "meshes/block.ply"
+        path.parent.mkdir(parents=True)
+        path.write_text("one")
+        shapes += MESH.format(folder)
+    place.scene.write_text(SCENE.replace("</scene>", shapes + "</scene>"))
     site = PlaceSite("mitsuba", place)
-    (tmp_path / "block.ply").write_text("one")
     before = site.describe()
     (tmp_path / "unused.ply").write_text("other")
     assert site.describe() == before
-    (tmp_path / "block.ply").write_text("two")
-    assert site.describe() != before
-    # without it, rendering says so
-    (tmp_path / "block.ply").unlink()
-    assert site.describe() != before
+    for folder in "ab":
+        path = tmp_path / folder / "meshes/block.ply"
+        path.write_text("two")
+        assert site.describe() != before
+        path.unlink()  # rendering says that it is missing
+        assert site.describe() != before
+        path.write_text("one")
+    assert site.describe() == before
 
 
-def test_files_of_equal_names_in_folders_of_equal_names_all_count(tmp_path):
-    place = write_place(tmp_path)
-    shapes = ""
-    for folder in ("a/meshes", "b/meshes"):
-        (tmp_path / folder).mkdir(parents=True)
-        (tmp_path / folder / "block.ply").write_text(folder)
-        named = MESH.replace("block.ply", f"{folder}/block.ply")
-        shapes += named.replace("<shape ", f'<shape id="{folder[0]}" ')
-    place.scene.write_text(SCENE.replace("</scene>", shapes + "</scene>"))
-    site = PlaceSite("mitsuba", place)
-    seen = [site.describe()]
-    for folder in ("a/meshes", "b/meshes"):
-        (tmp_path / folder / "block.ply").write_text("changed")
-        seen.append(site.describe())
-    assert all(one != other for one, other in zip(seen, seen[1:], strict=False))
+SERVER, TURNED = {"server": "127.0.0.1:2000/Town03"}, Pose.upright((1.0, 0, 0), 0.0)
 
 
 @pytest.mark.parametrize(
-    ("name", "package"),
-    [("mujoco", "mujoco"), ("mujoco_gl", "mujoco"), ("carla", "carla")],
+    ("name", "change", "is_equal"),
+    [
+        ("carla", SERVER, False),
+        ("mitsuba", SERVER, True),
+        ("surrogate", {"field_pose": Pose.identity()}, False),
+        ("surrogate", {"field_pose": TURNED}, False),
+    ],
 )
-def test_the_version_of_what_simulates_counts_where_it_simulates(
-    name, package, tmp_path, monkeypatch
-):
+def test_a_place_counts_where_it_is_used(tmp_path, name, change, is_equal):
     place = write_place(tmp_path)
+    one, two = (
+        PlaceSite(name, p).describe() for p in (place, replace(place, **change))
+    )
+    assert (json.dumps(one) == json.dumps(two)) is is_equal
+
+
+@pytest.mark.parametrize("name", ["mujoco", "mujoco_gl", "carla"])
+def test_the_version_of_what_simulates_counts_where_it_simulates(
+    name, tmp_path, monkeypatch
+):
+    place, package = write_place(tmp_path), name.removesuffix("_gl")
     sites = PlaceSite(name, place), PlaceSite("mitsuba", place)
     before = [site.describe() for site in sites]
-    whole = importlib.metadata.version
+    for found in ("99.0", "not installed"):
 
-    def version(asked: str) -> str:
-        return "99.0" if asked == package else whole(asked)
+        def version(asked: str, found=found) -> str:
+            if found[0].isdigit():
+                return found
+            raise importlib.metadata.PackageNotFoundError(asked)
 
-    monkeypatch.setattr(importlib.metadata, "version", version)
-    assert sites[0].describe() == {**before[0], package: "99.0"} != before[0]
-    assert sites[1].describe() == before[1]
-
-
-def test_a_package_that_is_not_installed_is_told_by_the_environment(
-    tmp_path, monkeypatch
-):
-    def version(asked: str) -> str:
-        raise importlib.metadata.PackageNotFoundError(asked)
-
-    monkeypatch.setattr(importlib.metadata, "version", version)
-    described = PlaceSite("carla", write_place(tmp_path)).describe()
-    assert described["carla"] == "not installed"
-
-
-def test_the_server_counts_for_carla_alone(tmp_path):
-    place = write_place(tmp_path)
-    other = replace(place, server="127.0.0.1:2000/Town03")
-    for name, is_equal in (("carla", False), ("mitsuba", True)):
-        one, two = (PlaceSite(name, item).describe() for item in (place, other))
-        assert (one == two) is is_equal
+        monkeypatch.setattr(importlib.metadata, "version", version)
+        assert sites[0].describe() == {**before[0], package: found}
+        assert sites[1].describe() == before[1]
 
 
 def test_there_are_as_many_objects_as_stand_beside_the_road(tmp_path):
@@ -97,11 +91,19 @@ def test_there_are_as_many_objects_as_stand_beside_the_road(tmp_path):
     assert bare.load_objects(2) == []
 
 
-def test_where_a_field_is_put_decides_about_the_frames(tmp_path):
-    place = write_place(tmp_path)
-    poses = None, Pose.identity(), Pose.upright((1.0, 0.0, 0.0), 0.0)
-    seen = [
-        PlaceSite("surrogate", replace(place, field_pose=p)).describe() for p in poses
-    ]
-    assert all(one != other for one, other in zip(seen, seen[1:], strict=False))
-    json.dumps(seen)
+def test_scatter_has_its_deviations_and_cuts(rng):
+    for close_share, part in ((0.0, 1.0), (1.0, 0.2)):
+        scatter = Scatter(close_share=close_share)
+        states = scatter.states(straight(), np.full(4000, 7.0), rng)
+        assert np.abs(states[:, 1]).max() <= 1.5 * part
+        assert np.abs(states[:, 2]).max() <= 0.4 * part
+        # of a normal cut at three standard deviations: 0.9867 of the deviation
+        assert states[:, 1].std() == pytest.approx(0.4933 * part, rel=0.04)
+        np.testing.assert_allclose(states[:, 0], 7.0)
+    states = Scatter(0.0, 0.0, 0.0, 0.0).states(straight(), np.full(3, 7.0), rng)
+    np.testing.assert_array_equal(states, [[7.0, 0.0, 0.0]] * 3)
+
+
+test_scatter_out_of_range_is_refused = refusals(
+    (lambda: Scatter(lateral_sd_m=-0.1), "Scatter.lateral_sd_m: -0.1")
+)

@@ -1,13 +1,16 @@
-"""Pages for contributors name folders, files and functions that are there."""
+"""Pages name files, functions and tests that are there, and the contents every page."""
 
 from __future__ import annotations
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+
+from docs.generate import MARK
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs/dev").glob("*.md"))]
@@ -21,7 +24,6 @@ by_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
 
 def items(text: str) -> list[str]:
-    """Split a page into paragraphs, items of lists and rows of tables."""
     text = re.sub(r"^\s*```.*?^\s*```$", "", text, flags=re.M | re.S)
     return re.split(r"\n\s*\n|\n(?=\s*- |\d+\. |\|)", text)
 
@@ -60,8 +62,55 @@ def test_the_picture_shows_the_folders_in_their_order():
     assert order is not None and shown == ast.literal_eval(order[1]).split()
 
 
-def test_the_picture_is_readable_on_a_dark_page():
-    root = ElementTree.parse(PICTURE).getroot()
-    ground = next(node for node in root if node.tag.endswith("rect"))
-    size = root.get("width"), root.get("height"), "#ffffff"
-    assert (ground.get("width"), ground.get("height"), ground.get("fill")) == size
+def test_every_page_is_in_the_contents():
+    docs = ROOT / "docs"
+    contents = [docs / "index.md", docs / "tutorials/index.md"]
+    listed = {
+        (page.parent / name).resolve()
+        for page in contents
+        for name in re.findall(
+            r"^- \[[^]]*\]\(([\w/.]+)\)", page.read_text("utf-8"), re.M
+        )
+    }
+    pages = {*docs.glob("**/*.md"), docs / "api/index.rst"}
+    assert pages - {docs / "index.md", docs / "pictures/README.md"} == listed
+
+
+def test_every_package_with_public_names_is_in_the_reference():
+    pages = (ROOT / "docs/api").glob("*.rst")
+    text = "".join(page.read_text("utf-8") for page in pages)
+    documented = set(re.findall(r"automodule:: (\S+)", text))
+    stubs = (ROOT / "mi_nerfattack").glob("**/__init__.pyi")
+    names = {".".join(stub.parent.relative_to(ROOT).parts) for stub in stubs}
+    assert documented == names | {"mi_nerfattack"}
+
+
+NAMED = re.findall(r"`(tests/[^`]*)`", (ROOT / "docs/faults.md").read_text("utf-8"))
+TESTS = sorted({name for name in NAMED if "::" in name})
+
+
+@cache
+def collected(path: Path) -> set[str]:
+    found = set()
+    for node in ast.parse(path.read_text("utf-8")).body:
+        if isinstance(node, ast.ClassDef) and node.name.startswith("Test"):
+            methods = (item for item in node.body if isinstance(item, ast.FunctionDef))
+            found |= {f"{node.name}::{item.name}" for item in methods}
+        elif isinstance(node, ast.FunctionDef):
+            found.add(node.name)
+    return {name for name in found if name.rpartition("::")[2].startswith("test_")}
+
+
+@pytest.mark.parametrize("name", TESTS)
+def test_a_named_test_is_there(name):
+    file, _, test = name.partition("::")
+    assert Path(file).name.startswith("test_")
+    assert test in collected(ROOT / file)
+
+
+def test_every_row_names_a_test():
+    page = (ROOT / "docs/faults.md").read_text("utf-8").partition(MARK)[0]
+    rows = re.findall(r"^\|(.*)\|$", page, re.M)
+    promises = [row for row in rows if not re.fullmatch(r"[-|]+|.* shown by ", row)]
+    assert len(promises) > 30
+    assert all(any(name in row for name in TESTS) for row in promises)

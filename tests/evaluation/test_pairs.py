@@ -4,24 +4,20 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.stats
-from helpers.made_drives import make_document, make_drive
+from support.files.runs import make_document, make_drive
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.evaluation.intervals import (
+from mi_nerfattack.evaluation.metrics import drives_of_run
+from mi_nerfattack.evaluation.pairs import compare, compare_departures
+from mi_nerfattack.evaluation.summary import (
     bootstrap_interval,
     interquartile_mean,
     mean_interval,
-)
-from mi_nerfattack.evaluation.pairs import (
-    Outcome,
-    compare,
-    compare_departures,
-    outcomes,
 )
 
 ERROR, OUT = "cross_track_mean_m", "wheel_out_s"
@@ -35,17 +31,25 @@ ERRORS = {
 }
 
 
-def side(number: int, figure: str = ERROR, table=None) -> list[Outcome]:
+COLUMNS = ["scenario", "seed", "environment", "case", "run", "start", ERROR]
+
+
+def table(*rows, figure=ERROR):
+    return pd.DataFrame(list(rows), columns=[*COLUMNS[:-1], figure])
+
+
+def side(number: int, figure: str = ERROR, errors=None) -> pd.DataFrame:
     case = ("attack", "own")[number]
-    return [
-        Outcome(name, seed, "surrogate", case, run, run, {figure: value})
-        for (name, seed), sides in (ERRORS if table is None else table).items()
+    rows = [
+        (name, seed, "surrogate", case, run, run, value)
+        for (name, seed), sides in (ERRORS if errors is None else errors).items()
         for run, value in enumerate(sides[number])
     ]
+    return table(*rows, figure=figure)
 
 
 def test_effect_by_hand():
-    found = compare(reversed(side(0)), side(1), ERROR)
+    found = compare(side(0)[::-1], side(1), ERROR)
     assert (found.attacks, found.drives, found.unpaired) == (4, 8, 0)
     assert found.seeds == 2
     assert found.one == pytest.approx(3.5 / 4)
@@ -79,38 +83,37 @@ def test_interval_is_efrons():
 
 
 def test_looks_of_one_start_are_averaged_and_strays_left_out():
-    attack = [Outcome("bend", 0, "surrogate", "attack", 0, 0, {ERROR: 0.5})]
-    attack.append(Outcome("bend", 7, "surrogate", "attack", 0, 0, {ERROR: 9.0}))
-    looks = [
-        Outcome("bend", 0, "surrogate", "random", run, run % 2, {ERROR: value})
-        for run, value in enumerate([0.1, 8.0, 0.3])
-    ]
+    attack = table(
+        ("bend", 0, "surrogate", "attack", 0, 0, 0.5),
+        ("bend", 7, "surrogate", "attack", 0, 0, 9.0),
+    )
+    looks = table(
+        *(
+            ("bend", 0, "surrogate", "random", run, run % 2, value)
+            for run, value in enumerate([0.1, 8.0, 0.3])
+        )
+    )
     found = compare(attack, looks, ERROR)
     assert (found.attacks, found.drives, found.unpaired) == (1, 1, 2)
     assert (found.one, found.other) == (0.5, pytest.approx(0.2))
 
 
 def test_one_attack_has_no_interval_and_no_spread():
-    table = {("bend", 0): ERRORS["bend", 0]}
-    found = compare(side(0, table=table), side(1, table=table), ERROR)
+    errors = {("bend", 0): ERRORS["bend", 0]}
+    found = compare(side(0, errors=errors), side(1, errors=errors), ERROR)
     assert found.attacks == found.seeds == 1
     assert found.difference == found.iqm == pytest.approx(0.4)
-    assert found.ratio == pytest.approx(5)
     intervals = found.difference_ci95, found.iqm_ci95, found.ratio_ci95
     assert intervals == (None, None, None) and found.spread is None
 
 
-def test_equal_attacks_give_points():
-    table = {("bend", seed): ([0.75], [0.25]) for seed in range(5)}
-    found = compare(side(0, table=table), side(1, table=table), ERROR)
+def test_equal_attacks_give_points_and_nothing_has_no_ratio():
+    errors = {("bend", seed): ([0.75], [0.25]) for seed in range(5)}
+    found = compare(side(0, errors=errors), side(1, errors=errors), ERROR)
     assert found.difference_ci95 == found.iqm_ci95 == [0.5, 0.5]
-    assert found.ratio_ci95 == [3, 3]
-    assert found.spread == 0 and found.seeds == 5
-
-
-def test_there_is_no_ratio_to_nothing():
-    table = {("bend", 0): ([0.5], [0.0]), ("bend", 1): ([0.5], [0.25])}
-    found = compare(side(0, table=table), side(1, table=table), ERROR)
+    assert found.ratio_ci95 == [3, 3] and (found.spread, found.seeds) == (0, 5)
+    errors = {("bend", 0): ([0.5], [0.0]), ("bend", 1): ([0.5], [0.25])}
+    found = compare(side(0, errors=errors), side(1, errors=errors), ERROR)
     assert (found.ratio, found.ratio_ci95) == (None, None)
     assert found.difference_ci95 == [0.25, 0.5]
 
@@ -125,18 +128,15 @@ def test_one_that_differs_does_not_tell_the_interval_of_the_quartiles():
 
 def test_departures_by_hand():
     """Of eight attacks, five depart under attack alone, and one on both sides."""
-    table = {("bend", seed): ([0.5, 1.5], [0.0, 0.9]) for seed in range(5)}
-    table |= {("lane", 0): ([3.0], [1.0]), ("lane", 1): ([0.9], [0.9])}
-    table["lane", 2] = [0.0, 1.9], [0.0, 0.0]  # once, but not on average
-    sides = side(0, OUT, table), side(1, OUT, table)
+    errors = {("bend", seed): ([0.5, 1.5], [0.0, 0.9]) for seed in range(5)}
+    errors |= {("lane", 0): ([3.0], [1.0]), ("lane", 1): ([0.9], [0.9])}
+    errors["lane", 2] = [0.0, 1.9], [0.0, 0.0]  # once, but not on average
+    sides = side(0, OUT, errors), side(1, OUT, errors)
     found = compare_departures(*sides)
     assert (found.both, found.one, found.other, found.neither) == (1, 5, 0, 2)
     assert found.p_value == pytest.approx(2 / 2**5)  # five of five, either way
-    # Wilson's interval of 6 in 8, by its formula
-    z, share = 1.959963984540054, 6 / 8
-    middle = (share + z**2 / 16) / (1 + z**2 / 8)
-    half = z / (1 + z**2 / 8) * math.sqrt(share * (1 - share) / 8 + z**2 / 256)
-    assert found.one_ci95 == pytest.approx([middle - half, middle + half])
+    ends = scipy.stats.binomtest(6, 8).proportion_ci(method="wilson")
+    assert found.one_ci95 == pytest.approx(list(ends))
     assert found.other_ci95[0] < 1 / 8 < found.other_ci95[1]
     assert compare_departures(sides[1], sides[0]).p_value == found.p_value
     assert compare_departures(sides[0], sides[0]).p_value == 1  # none differ
@@ -146,38 +146,34 @@ def test_departures_by_hand():
 def test_a_run_gives_its_drives_with_their_starts():
     drives = [make_drive([0.1], case="own", run=k) for k in range(2)]
     drives += [make_drive([0.2 + 0.1 * k], case="random", run=k) for k in range(3)]
-    document = make_document(drives)
-    found = outcomes(document, "surrogate", "random", "bend")
-    assert [(o.scenario, o.seed, o.run, o.start) for o in found] == [
-        ("bend", 7, 0, 0),
-        ("bend", 7, 1, 1),
-        ("bend", 7, 2, 0),
+    found = drives_of_run(make_document(drives))
+    own, random = (found[found["case"] == case] for case in ("own", "random"))
+    names = ["scenario", "seed", "environment", "run", "start", "drive_seed"]
+    assert random[names].to_numpy().tolist() == [
+        ["x", 7, "surrogate", 0, 0, 100],
+        ["x", 7, "surrogate", 1, 1, 101],
+        ["x", 7, "surrogate", 2, 0, 102],
     ]
-    assert found[2].figures[ERROR] == pytest.approx(0.4)
-    assert outcomes(document, "surrogate", "own")[0].scenario == "x"
-    effect = compare(found, outcomes(document, "surrogate", "own", "bend"), ERROR)
+    assert random[ERROR].tolist() == pytest.approx([0.2, 0.3, 0.4])
+    assert own["start"].tolist() == [0, 1] and not found["departed"].any()
+    effect = compare(random, own, ERROR)
     assert effect.difference == pytest.approx((0.2 + 0.2) / 2)
-    with pytest.raises(InputError, match="mitsuba / own: no such.*surrogate / random"):
-        outcomes(document, "mitsuba", "own")
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "named"),
     [
-        ({"case": "random"}, "drives of surrogate / attack, surrogate / random"),
-        ({"run": 0}, "bend, seed 0, run 0: twice on one side"),
-        ({"figures": {}}, f"bend, seed 0, run 1: {ERROR} is None"),
-        ({"figures": {ERROR: math.nan}}, f"run 1: {ERROR} is nan"),
+        ({"case": "random"}, "surrogate / attack, surrogate / random"),
+        ({"run": 0}, "bend, seed 0, run 0: "),
+        ({ERROR: math.nan}, f"bend, seed 0, run 1: {ERROR} is nan"),
     ],
 )
-def test_sides_that_cannot_be_compared_are_refused(change, message):
-    drive = Outcome("bend", 0, "surrogate", "attack", 0, 0, {ERROR: 0.5})
-    second = replace(drive, run=1, start=1)
-    with pytest.raises(InputError, match=message):
-        compare([drive, replace(second, **change)], [drive], ERROR)
-
-
-def test_without_pairs_there_is_nothing_to_compare():
-    drive = Outcome("bend", 0, "surrogate", "attack", 0, 0, {ERROR: 0.5})
+def test_sides_that_cannot_be_compared_are_refused(change, named):
+    drive = table(("bend", 0, "surrogate", "attack", 0, 0, 0.5))
+    second = drive.assign(**{"run": 1, "start": 1, **change})
+    with pytest.raises(InputError, match=named):
+        compare(pd.concat([drive, second]), drive, ERROR)
+    with pytest.raises(InputError, match="moon.* scenario, seed"):
+        compare(drive, drive, "moon")
     with pytest.raises(InputError, match="1 starts on one side, 0 on the other"):
-        compare([drive], [], ERROR)
+        compare(drive, drive[:0], ERROR)

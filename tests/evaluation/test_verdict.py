@@ -1,30 +1,45 @@
-"""The verdict of a run, from figures that are known."""
+"""The verdict and the flags of a run, raised and not raised by known figures."""
 
 from __future__ import annotations
 
 import re
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from mi_nerfattack.evaluation.verdict import verdict
+from mi_nerfattack.evaluation.pairs import compare
+from mi_nerfattack.evaluation.verdict import (
+    black_box_better,
+    noise_larger,
+    run_flags,
+    verdict,
+)
 
 
-def case(mean: float, departed: int = 0, largest: float = 0.2) -> dict[str, object]:
-    """Return the figures of drives from four starts that differ by a fifth."""
-    errors = mean * np.array([0.8, 1.0, 1.0, 1.2])
-    rows = [{"run": k, "cross_track_mean_m": e} for k, e in enumerate(errors)]
+def case(means, departed: int = 0, largest: float = 0.2) -> dict[str, object]:
+    """Return figures of drives of mean errors, or of four that differ by a fifth."""
+    if isinstance(means, float):
+        means = means * np.array([0.8, 1.0, 1.0, 1.2])
+    rows = [
+        {"run": k, "seed": k, "cross_track_mean_m": mean, "steps_departed": 0}
+        for k, mean in enumerate(means)
+    ]
     return {
         "per_run": rows,
-        "cross_track_mean_m": mean,
+        "cross_track_mean_m": np.mean(means),
         "cross_track_max_m": largest,
         "drives_departed": departed,
-        "n": 4,
+        "n": len(means),
     }
 
 
+def curve(frames: list[float], objective: list[float]) -> dict[str, list[float]]:
+    return {"frames": frames, "objective": objective}
+
+
 @pytest.fixture
-def document():
+def judged():
     cases = {
         "no_object": case(0.04),
         "own": case(0.05, largest=0.11),
@@ -43,36 +58,126 @@ def document():
     }
 
 
-def test_each_sentence_says_what_the_figures_say(document):
-    policy, attack, transfer, search, texture = verdict(document, "surrogate")
-    assert "is sound" in policy
-    assert "0.20 m of the lane centre, where 0.85 m" in policy
-    assert "beats random looks in the surrogate" in attack
-    assert "0.300 m, 6.0 times that of random looks (95 % interval over 4" in attack
-    assert "4 starts: 6.0 to 6.0)" in attack  # both sides by the same factor
-    assert "3.0 times that of the best of them; 3 of 4 drives leave" in attack
-    assert "does not transfer to mitsuba" in transfer
-    assert "1.2 times" in transfer
-    assert search == "The search has converged."
-    assert "No texture is saturated: at most 30%" in texture
+def test_each_sentence_says_what_the_figures_say(judged):
+    policy, attack, transfer, search, texture = verdict(judged, "surrogate")
+    for sentence, words in (
+        (policy, ["is sound", "0.20 m", "0.85 m"]),
+        # both sides by the same factor
+        (attack, ["beats", "0.300 m, 6.0 times", "4 starts: 6.0 to 6.0)"]),
+        (attack, ["3.0 times that of the best of them", "3 of 4 drives leave"]),
+        (transfer, ["does not transfer to mitsuba", "1.2 times"]),
+        (search, ["converged"]),
+        (texture, ["30%"]),
+    ):
+        assert all(word in sentence for word in words), sentence
 
 
-def test_the_interval_is_that_of_equal_starts(document):
+def test_the_interval_is_that_of_equal_starts(judged):
     """The attack is strong from one start alone, so that its ratio is uncertain."""
-    rows = document["routes"]["right"]["surrogate"]["attack"]["per_run"]
-    for row, error in zip(rows, (0.04, 0.05, 0.05, 1.06), strict=True):
-        row["cross_track_mean_m"] = error
-    _, attack, *_ = verdict(document, "surrogate")
+    cases = judged["routes"]["right"]["surrogate"]
+    cases["attack"] = case([0.04, 0.05, 0.05, 1.06])
+    _, attack, *_ = verdict(judged, "surrogate")
     low, high = map(float, re.findall(r"starts: ([\d.]+) to ([\d.]+)\)", attack)[0])
     assert low < 1.1 and high > 10
 
 
-def test_what_speaks_against_an_attack_is_said(document):
-    cases = document["routes"]["right"]["surrogate"]
+def test_what_speaks_against_an_attack_is_said(judged):
+    cases = judged["routes"]["right"]["surrogate"]
     cases["own"], cases["attack"] = case(0.5, 4, 6.0), case(0.08)
-    document |= {"converged": False, "textures": {"ball": {"saturated_share": 0.8}}}
-    document["routes"]["right"]["mitsuba"]["attack"] = case(0.2)
-    policy, attack, transfer = verdict(document, "surrogate")
-    assert "not sound here: it leaves its lane by itself in surrogate (unatt" in policy
-    assert "does not beat random looks" in attack
-    assert "It transfers to mitsuba" in transfer
+    judged |= {"converged": False, "textures": {"ball": {"saturated_share": 0.8}}}
+    judged["routes"]["right"]["mitsuba"]["attack"] = case(0.2)
+    policy, attack, transfer = verdict(judged, "surrogate")
+    assert "not sound" in policy and "in surrogate (unattacked)" in policy
+    assert "does not beat" in attack and "It transfers to mitsuba" in transfer
+
+
+@pytest.fixture
+def document():
+    """A run that no flag speaks against."""
+    cases = {"random": case([0.05] * 11, 1), "attack": case([0.3, 0.5], 2)}
+    return {
+        "routes": {"right": {"surrogate": cases, "mitsuba": {"own": case([0.02])}}},
+        "converged": True,
+        "curve": curve([10, 30, 50, 70, 90, 110], [0.0, -3.0, -4.0, -6.0, -8.0, -10.0]),
+        "baseline": {"objectives": [-1.0, -1.5, -3.0, -0.5]},
+        "textures": {"ball": {"saturated_share": 0.49, "picture_share": 0.001}},
+    }
+
+
+def check(document, name, *numbers, without=(), by_gradient=True) -> None:
+    """Check that one flag is raised, and what it gives; without a name, none."""
+    flags = list(run_flags(document, without, by_gradient))
+    assert len(flags) == bool(name), flags
+    for flag in flags:
+        assert flag.startswith(f"{name}: ")
+        assert all(number in flag for number in numbers), flag
+
+
+def test_a_good_run_raises_none(document):
+    """Random looks reach -3 after 40 frames, as the gradient; one in eleven departs."""
+    check(document, "")
+    check(document, "gradient zero", "ball, car", without=["ball", "car"])
+
+
+def test_random_looks_that_find_more_are_an_alarm_on_gradients_alone(document):
+    """After 40 frames, of which a look takes 10, the gradient is at -3."""
+    document["baseline"]["objectives"][1] = -9.0
+    check(document, "black box better", "40 frames", "-9,", "-3 ")
+    check(document, "", by_gradient=False)
+    del document["curve"]  # of an attack that went on by force
+    check(document, "")
+
+
+def test_methods_are_compared_at_frames_that_both_reach():
+    gradient = curve([10, 30, 50], [0.0, -3.0, -4.0])
+    blocks = curve([10, 20, 30, 40], [-1.0, -2.0, -3.5, -9.0])
+    [flag] = black_box_better(gradient, {"blocks": blocks, "cma_es": gradient})
+    assert all(word in flag for word in ("40 frames, blocks", "-9, ", "-3 "))
+    shorter = curve([10, 30], [-1.0, -3.5])  # the gradient's last then is -3
+    assert len(list(black_box_better(gradient, {"blocks": shorter}))) == 1
+    soon = curve([10, 20], [-1.0, -2.0])  # before its first iteration has ended
+    assert list(black_box_better(gradient, {"blocks": soon})) == []
+    assert list(black_box_better(blocks, {"cma_es": gradient})) == []
+    late = curve([60], [-99.0])  # none of it with 50 frames
+    assert list(black_box_better(gradient, {"blocks": late})) == []
+
+
+def test_random_looks_that_suffice(document):
+    document["routes"]["right"]["surrogate"]["random"] = case([0.05] * 10, 1)
+    check(document, "random enough", "in surrogate", "1 of 10")
+
+
+def test_drives_that_differ_more_than_an_attack_adds(document):
+    """Means 0.3 and 0.1; variances 0.5 and 0.02, so that the noise is 0.51."""
+    cases = {"attack": case([-0.2, 0.8]), "random": case([0.0, 0.2])}
+    document["routes"]["right"]["mitsuba"] = cases
+    check(document, "noise larger", "in mitsuba (m), is 0.2,", "drive to drive 0.51;")
+    cases["random"] = case([0.1])  # one says nothing
+    check(document, "")
+
+
+def test_seeds_that_differ_more_than_an_effect():
+    """Differences 0.1 and 0.5: mean 0.3, standard deviation sqrt(0.08) = 0.28."""
+    about = {"scenario": "bend", "environment": "surrogate", "run": 0, "start": 0}
+    own = pd.DataFrame({"seed": [0, 1], "e": [0.0, 0.0]}).assign(case="own", **about)
+    attack = own.assign(case="attack", e=[0.1, 0.5])
+    assert list(noise_larger(compare(attack, own, "e"), "error")) == []
+    attack["e"] = [-0.1, 0.5]  # 0.2, sqrt(0.18) = 0.42
+    [flag] = noise_larger(compare(attack, own, "e"), "error")
+    assert "error, is 0.2," in flag and "seed to seed 0.424;" in flag
+    assert list(noise_larger(compare(attack[:1], own, "e"), "error")) == []
+
+
+def test_an_attack_that_had_more_to_gain(document):
+    """After 88 of 110 frames it is at -6, of -10 in the end and 0 before."""
+    document["converged"] = False
+    check(document, "not converged", "40%")
+    del document["curve"]  # of an attack that went on by force
+    check(document, "not converged")
+
+
+def test_textures_at_their_bounds_and_out_of_view(document):
+    document["textures"]["car"] = {"saturated_share": 0.5, "picture_share": 0.1}
+    check(document, "texture at its bounds", "50%", "car")
+    document["textures"]["car"] = {"saturated_share": 0.0, "picture_share": 0.00099}
+    check(document, "object hardly in view", "car takes 0.099 %")

@@ -5,29 +5,31 @@ from __future__ import annotations
 from pathlib import Path
 
 import mitsuba as mi
-import numpy as np
 import pytest
-from helpers import attack_jobs
-from helpers import toy_loop as toy
+from support.worlds import attacks as attack_jobs
+from support.worlds import loops as toy
 
-from mi_nerfattack.fields import load_grid, save_field
+from mi_nerfattack.experiment import results
+from mi_nerfattack.experiment.job import Job
 from mi_nerfattack.io import files
+from mi_nerfattack.scenario.scenario import load_scenario
 
 _POLICY = """\
 [policy]
 file = "smooth.py:SmoothPolicy"
 trust_code = true
-goal = "integer"
-goals = 3
+goal = { kind = "integer", count = 3 }
 """
+#: The camera of the toy loop's policy.
+CAMERA = f"[camera]\nwidth = {toy.WIDTH}\nheight = {toy.HEIGHT}\n[drive]"
 _FOUND = {
     '[policy]\nfile = "policy.safetensors"\n': _POLICY,
-    "[drive]": f"[camera]\nwidth = {toy.WIDTH}\nheight = {toy.HEIGHT}\n[drive]",
+    "[drive]": CAMERA,
     "max_iterations = 30": "max_iterations = 2",
     "textures = 4": "textures = 2",
     "[7.0, 4.2, 1.6]": "[-15.0, 2.6, 1.6]",
 }
-_POSES = '[attack]\nparameters = "both"\npose_limit_m = 0.2\n'
+_POSES = '[attack]\nfreedom.kind = "both"\nfreedom.pose_limit_m = 0.2\n'
 
 
 @pytest.fixture(scope="module")
@@ -47,18 +49,15 @@ def scenario_folder(tmp_path_factory):
 def folder(tmp_path_factory):
     """A scenario for jobs with the toy loop's policy."""
     mi.set_variant("llvm_ad_rgb")
-    camera = f"[camera]\nwidth = {toy.WIDTH}\nheight = {toy.HEIGHT}\n[drive]"
     changes = {
         "max_iterations = 30": "max_iterations = 6",
         "textures = 4": "textures = 2",
-        "[drive]": camera,
+        "[drive]": CAMERA,
     }
     return attack_jobs.write_scenario(tmp_path_factory.mktemp("scenario"), changes)
 
 
 def leave_out_results(monkeypatch):
-    from mi_nerfattack.experiment import results
-
     def only_numbers(output, done, effort, *more):
         cost = effort().model_dump()
         files.write_json(output / "metrics.json", {"cost": cost})
@@ -84,21 +83,22 @@ def whole(folder, tmp_path_factory):
         return output, attack_jobs.job(folder, output).run()
 
 
+def write_found(folder: Path) -> Path:
+    """Write a scenario of which poses and textures are attacked; return its file."""
+    attack_jobs.write_scenario(folder, _FOUND)
+    attack_jobs.make_dense(folder)
+    (folder / "smooth.py").write_text("from support.worlds.loops import SmoothPolicy\n")
+    path = folder / "scenario.toml"
+    path.write_text(path.read_text().replace("[attack]", _POSES))
+    return path
+
+
 @pytest.fixture(scope="session")
 def found_run(tmp_path_factory) -> Path:
     """The folder of a finished attack of poses and texture, without pictures."""
-    from mi_nerfattack.experiment.job import Job
-    from mi_nerfattack.scenario.scenario import load_scenario
-
     mi.set_variant("llvm_ad_rgb")
-    folder = attack_jobs.write_scenario(tmp_path_factory.mktemp("scenario"), _FOUND)
-    item = load_grid(folder / "object.safetensors")
-    item.set_parameter("density", np.full(item.n_vertices, 3.0, np.float32))
-    save_field(folder / "object.safetensors", item)
-    (folder / "smooth.py").write_text("from helpers.toy_loop import SmoothPolicy\n")
-    path = folder / "scenario.toml"
-    path.write_text(path.read_text().replace("[attack]", _POSES))
+    path = write_found(tmp_path_factory.mktemp("scenario"))
     scenario, text = load_scenario(path)
-    job = Job(scenario, text, scenario.build_policy(), folder / "run", frames=None)
-    job.run(anyway=True)
-    return folder / "run"
+    output = path.parent / "run"
+    Job(scenario, text, scenario.build_policy(), output, frames=None).run(anyway=True)
+    return output

@@ -2,73 +2,41 @@
 
 from __future__ import annotations
 
-import itertools
+import dataclasses
 
 import numpy as np
 import pytest
-from helpers.small_fields import blob, vertices
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.text import Text
-from PIL import Image
+from support.pages.read import drawn
+from support.worlds import loops as toy
+from support.worlds.fields import blob, vertices
 
+from mi_nerfattack.attack.gradient import GradientAttack
+from mi_nerfattack.attack.objectives import AbsoluteDeviation
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.attribution import (
+    FailureAttribution,
+    attribute,
+    write_attribution,
+)
 from mi_nerfattack.io import files
-from mi_nerfattack.report.plots import charts, heat
+from mi_nerfattack.report.plots import heat
 from mi_nerfattack.report.plots.heat import (
     SIDES,
-    SideView,
     side_views,
     surface_heat,
-    write_heat,
 )
-from mi_nerfattack.report.plots.time import TimeAttribution, plot_attribution
+from mi_nerfattack.report.plots.time import TimeAttribution
+from mi_nerfattack.rollout.function import Rollout
+from mi_nerfattack.rollout.objective import StageSum
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 
-def attribution(steps=5, vehicles=2, size=3, **changes):
-    rng = np.random.default_rng(0)
-    fields = {
-        "time_s": 0.1 * np.arange(1, steps + 1),
-        "costates": rng.normal(size=(steps, vehicles, size)),
-        "along": rng.normal(1, 1, (steps, 2)),
-        "cross_track_m": rng.normal(size=(steps, vehicles)),
-        "limit_m": 0.85,
-        "objects": ["hydrant", "poster"],
-    }
-    return TimeAttribution(**{**fields, **changes})
-
-
 def test_shares_are_parts_of_the_gradient():
-    along = np.array([[1.0, 2.0], [-1.0, 6.0]])
-    data = attribution(2, along=along)
+    along, rest = np.array([[1.0, 2.0], [-1.0, 6.0]]), np.zeros((2, 1, 3))
+    data = TimeAttribution(np.arange(2), rest, along, along, 0.85, ["a", "b"])
     np.testing.assert_allclose(data.shares, [[0.125, 0.25], [-0.125, 0.75]])
-    assert not attribution(2, along=0 * along).shares.any()
-
-
-@pytest.mark.parametrize(
-    ("steps", "vehicles", "size"), [(5, 2, 3), (1, 1, 3), (3, 1, 4), (1, 4, 5)]
-)
-def test_plot(tmp_path, steps, vehicles, size):
-    path = tmp_path / "attribution.png"
-    plot_attribution(path, attribution(steps, vehicles, size))
-    with Image.open(path) as image:
-        assert image.width == 1200
-    first = path.read_bytes()
-    plot_attribution(path, attribution(steps, vehicles, size))
-    assert path.read_bytes() == first
-
-
-def test_plot_without_a_gradient(tmp_path):
-    """A drive that no texture changes is drawn, too."""
-    zero = np.zeros((5, 2))
-    data = attribution(along=zero, costates=np.zeros((5, 2, 3)), cross_track_m=zero)
-    plot_attribution(tmp_path / "attribution.png", data)
-
-
-def test_gradients_that_are_not_finite_are_named():
-    with pytest.raises(InputError, match="along: not finite"):
-        attribution(along=np.full((5, 2), np.nan))
+    assert not dataclasses.replace(data, along=0 * along).shares.any()
 
 
 def shown(grid):
@@ -114,53 +82,8 @@ def test_heat_lies_where_the_gradient_is(rng):
     assert np.nansum(views["from -y"][:, : width // 2]) < 0.05 * left
 
 
-def test_picture(tmp_path, rng):
-    grid = blob(rng)
-    gradient = rng.normal(size=(grid.n_vertices, 3))
-    views = side_views(grid, gradient, 24)
-    path = tmp_path / "attribution_object.png"
-    write_heat(path, {"hydrant": views, "poster": views})
-    with Image.open(path) as image:
-        assert image.width == 1200 and image.height > 1000
-    write_heat(path, {"still": side_views(grid, 0 * gradient, 24)})
-
-
-def test_no_label_of_the_picture_is_cut_or_covered(tmp_path, monkeypatch):
-    """Of flat objects with long names, too."""
-    figures = []
-    monkeypatch.setattr(charts, "save", lambda path, figure: figures.append(figure))
-    shapes = {"a_delivery_van_beside_the_exit": (50, 160), "a_hydrant": (160, 90)}
-    objects = {
-        name: [SideView(side, np.ones((*shape, 3)), np.ones(shape)) for side in SIDES]
-        for name, shape in shapes.items()
-    }
-    for shown in (objects, dict([*objects.items()][:1])):
-        write_heat(tmp_path / "heat.png", shown)
-    for figure in figures:
-        FigureCanvasAgg(figure).draw()
-        words = [t for t in figure.findobj(Text) if t.get_visible() and t.get_text()]
-        assert {"as it looks", "sensitivity"} <= {text.get_text() for text in words}
-        boxes, page = (
-            [text.get_window_extent() for text in words],
-            figure.bbox.padded(1),
-        )
-        for box in boxes:
-            assert page.x0 <= box.x0 < box.x1 <= page.x1
-            assert page.y0 <= box.y0 < box.y1 <= page.y1
-        for one, other in itertools.combinations(boxes, 2):
-            assert not one.overlaps(other)
-
-
-def test_a_failure_is_taken_apart(tmp_path):
+def test_a_failure_is_taken_apart(tmp_path, monkeypatch):
     """Shares add up to 1; the last costate is minus the derivative of the last cost."""
-    from helpers import toy_loop as toy
-
-    from mi_nerfattack.attack.gradient import GradientAttack
-    from mi_nerfattack.attack.objectives import AbsoluteDeviation
-    from mi_nerfattack.experiment.attribution import attribute, write_attribution
-    from mi_nerfattack.rollout.function import Rollout
-    from mi_nerfattack.rollout.objective import StageSum
-
     loop, grid = toy.make_loop()
     objective = StageSum(AbsoluteDeviation(toy.ROUTE))
     initial = loop.initial(np.array([[0.0, 0.1, 0.0], [0.0, -0.2, 0.05]]))
@@ -181,8 +104,25 @@ def test_a_failure_is_taken_apart(tmp_path):
     np.testing.assert_allclose(
         times.costates[-1], [[0, side[0] / 2, 0], [0, side[1] / 2, 0]], atol=1e-12
     )
+    figures = drawn(monkeypatch)
     write_attribution(tmp_path, found, [grid])
-    pictures = list(tmp_path.glob("attribution*.png"))
-    assert len(pictures) == 2 and all(p.stat().st_size > 5000 for p in pictures)
     data = files.read_json(tmp_path / "attribution.json")
-    assert len(data["gradient_share"]["ball"]) == 3
+    assert data["gradient_share"]["ball"] == times.shares[:, 0].tolist()
+    costates, shares, errors = figures[0].axes
+    turn = np.abs(times.costates[:, :, 2]).mean(1)
+    np.testing.assert_allclose(costates.lines[-1].get_ydata(), turn)
+    heights = [bar.get_height() for bar in shares.containers[0]]
+    np.testing.assert_allclose(heights, 100 * times.shares[:, 0])
+    distance = np.abs(times.cross_track_m).mean(1)
+    np.testing.assert_allclose(errors.lines[2].get_ydata(), distance)
+    assert len(figures[1].axes) == 2 * len(SIDES) + 1  # textures, heat, colour bar
+
+
+def test_a_drive_that_no_texture_changes_is_drawn(tmp_path):
+    grid, zero = toy.make_loop()[1], np.zeros((1, 1))
+    costates, names = np.zeros((1, 1, 3)), ["still"]
+    times = TimeAttribution(zero[0] + 0.1, costates, zero, zero, 0.85, names)
+    textures = [np.zeros((grid.n_vertices, 3))]
+    write_attribution(tmp_path, FailureAttribution(times, zero, textures), [grid])
+    with pytest.raises(InputError, match="along: not finite"):
+        dataclasses.replace(times, along=zero + np.nan)

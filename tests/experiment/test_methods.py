@@ -7,28 +7,27 @@ import re
 
 import numpy as np
 import pytest
-from helpers.attack_jobs import assert_same_drives, interrupt, job
+from support.worlds.attacks import assert_same_drives, interrupt, job
 
 from mi_nerfattack import cli
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.baseline import Baseline
-from mi_nerfattack.experiment.effort import Effort
-from mi_nerfattack.scenario.scenario import load_scenario
+from mi_nerfattack.experiment.run_folder import Effort
 from mi_nerfattack.scenario.world import build_attack, build_world, judged_frames
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-ITERATIONS = "max_iterations = 6"
+ITERATIONS = "method.max_iterations = 6"
 SEARCHES = {
     "random": "",
-    "blocks": "first_block = 0.2",
-    "cma_es": 'variant = "learning_rate"\npopulation = 4\ncoefficients = 24',
-    "bayesian": "coefficients = 3",
+    "blocks": ", first_block = 0.2",
+    "cma_es": ', variant = "learning_rate", population = 4, coefficients = 24',
+    "bayesian": ", coefficients = 3",
 }
 
 
 def keys(method: str, frames: int = 12) -> str:
-    return f'method = "{method}"\nframes = {frames}\n{SEARCHES[method]}'
+    return f'method = {{ kind = "{method}", frames = {frames}{SEARCHES[method]} }}'
 
 
 @pytest.mark.parametrize("method", ["random", "blocks", "cma_es", "bayesian"])
@@ -59,9 +58,8 @@ def test_searches_spend_their_frames_and_keep_the_best(
     assert (tmp_path / "run" / "metrics.json").is_file()
 
 
-@pytest.mark.parametrize("method", ["blocks", "cma_es"])
-def test_an_interrupted_search_goes_on(folder, tmp_path, no_results, method):
-    change = (ITERATIONS, keys(method))
+def test_an_interrupted_search_goes_on(folder, tmp_path, no_results):
+    change = (ITERATIONS, keys("cma_es"))
     whole = job(folder, tmp_path / "whole", change).run()
     output = tmp_path / "output"
     stage = "surrogate: optimisation", 9
@@ -70,21 +68,17 @@ def test_an_interrupted_search_goes_on(folder, tmp_path, no_results, method):
     assert_same_drives(resumed["drives"], whole["drives"])
     assert resumed["curve"] == whole["curve"]
     assert resumed["curve"]["frames"] == [2, 4, 6, 8, 10, 12]
-
-
-def test_a_search_does_not_go_on_in_another_scenario(folder, tmp_path, no_results):
-    output, change = tmp_path / "output", (ITERATIONS, keys("blocks"))
-    interrupt(folder, output, "surrogate: optimisation", 9, change=change)
-    other = keys("blocks", 14)
-    with pytest.raises(InputError, match="another scenario.* start a new run folder"):
+    # by force it goes on in no other scenario
+    other = keys("cma_es", 14)
+    with pytest.raises(InputError, match="start a new run folder"):
         job(folder, output, (ITERATIONS, other)).run(force=True)
 
 
 @pytest.mark.parametrize(
-    "method", ['"open_loop"\nmax_iterations = 3', '"single_frame"\nframe = 1']
+    "method", ['"open_loop", max_iterations = 3', '"single_frame", frame = 1']
 )
 def test_attacks_on_an_unattacked_path(folder, tmp_path, no_results, method):
-    change = (ITERATIONS, f"method = {method}")
+    change = (ITERATIONS, f"method = {{ kind = {method} }}")
     work = job(folder, tmp_path / "run", change)
     attack = build_attack(build_world(work.scenario, work.policy))
     count = 3 if "open" in method else 48
@@ -96,43 +90,32 @@ def test_attacks_on_an_unattacked_path(folder, tmp_path, no_results, method):
 
 
 def test_searches_change_textures_alone(folder, tmp_path):
-    text = keys("random") + '\nparameters = "both"'
+    text = keys("random") + '\nfreedom.kind = "both"'
     work = job(folder, tmp_path / "run", (ITERATIONS, text))
     with pytest.raises(InputError, match="searches change textures alone"):
         build_attack(build_world(work.scenario, work.policy))
 
 
-def test_keys_belong_to_methods(scenario_folder):
-    path = scenario_folder / "other.toml"
-    text = (scenario_folder / "scenario.toml").read_text()
-    path.write_text(text.replace("max_iterations = 3", 'method = "blocks"\nframe = 1'))
-    with pytest.raises(InputError, match='attack.frame.*method = "blocks"'):
-        load_scenario(path)
-
-
 def test_a_policy_without_derivatives_is_attacked(scenario_folder, tmp_path, capsys):
     """From check to the page; nothing is attributed, for that takes a gradient."""
-    folder = scenario_folder
-    (folder / "mine.py").write_text(
+    (scenario_folder / "mine.py").write_text(
         "def drive(image, goal, step):\n"
         "    return 3 * (image[..., :99].mean((1, 2, 3)) - image.mean((1, 2, 3)))\n"
     )
-    text = (folder / "scenario.toml").read_text()
+    text = (scenario_folder / "scenario.toml").read_text()
     found = 'kind = "callable"\nfile = "mine.py:drive"\ntrust_code = true'
     text = re.sub(r"(?ms)^\[policy\]\n.*?(?=^\[)", f"[policy]\n{found}\n\n", text)
-    gradient = folder / "gradient.toml"
-    gradient.write_text(text)
-    search = folder / "search.toml"
-    search.write_text(text.replace("max_iterations = 3", keys("blocks", 16)))
-    output = tmp_path / "run"
-    assert cli.main(["attack", str(gradient), "-o", str(output)]) == 2
-    assert "a gradient attack takes the kinds" in capsys.readouterr().err
-    picture = str(tmp_path / "seen.png")
-    assert cli.main(["check", str(search), "--json", "-o", picture]) in (0, 1)
+    path, output = scenario_folder / "other.toml", tmp_path / "run"
+    path.write_text(text)
+    attack = ["attack", str(path), "-o", str(output)]
+    assert cli.main(attack) == 2
+    assert "derivatives" in capsys.readouterr().err
+    path.write_text(text.replace("method.max_iterations = 3", keys("blocks", 16)))
+    check = ["check", str(path), "--json", "-o", str(tmp_path / "seen.png")]
+    assert cli.main(check) in (0, 1)
     cost = json.loads(capsys.readouterr().out.splitlines()[-1])["cost"]
     assert cost["iterations"] == 4 and cost["period_s"]["backward"] == 0
-    assert cli.main(["attack", str(search), "-o", str(output), "--anyway"]) == 0
-    history = json.loads((output / "attack.json").read_text())
-    assert len(history) == 4
+    assert cli.main([*attack, "--anyway"]) == 0
+    assert len(json.loads((output / "attack.json").read_text())) == 4
     assert (output / "report.html").is_file() and (output / "strip.png").is_file()
     assert not list(output.glob("attribution*.png"))

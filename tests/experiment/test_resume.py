@@ -1,42 +1,43 @@
-"""Attacks that are interrupted and go on; the deterministic mode."""
+"""Attacks that go on, also as another scenario; the deterministic mode."""
 
 from __future__ import annotations
 
-import json
 import random
 import shutil
 import signal
-import subprocess
-import sys
 
+import drjit as dr
 import numpy as np
 import pytest
 import torch
-from helpers.attack_jobs import (
+from support.faults.refusals import refused_at
+from support.worlds.attacks import (
     ROBUST,
-    STAGES,
     assert_same_drives,
     assert_same_state,
     checkpoint_of,
+    contents,
     interrupt,
     job,
-    stop_at,
 )
 
+from mi_nerfattack.attack.gradient import Adam
 from mi_nerfattack.backend import determinism
 from mi_nerfattack.backend.interrupts import held_interrupts
 from mi_nerfattack.errors import InputError, SetupError
+from mi_nerfattack.experiment import job as module
+from mi_nerfattack.io import files, resumable
+from mi_nerfattack.rollout.function import Rollout
+from mi_nerfattack.scenario.scenario import load_scenario
 
-pytestmark = pytest.mark.usefixtures("variant")
-
+pytestmark = pytest.mark.usefixtures("variant", "no_results")
 
 FIFTY = (  # without converging before
-    "max_iterations = 6\nlearning_rate = 0.5",
-    "max_iterations = 50\nlearning_rate = 0.02" + ROBUST,
+    "max_iterations = 6\nfreedom.learning_rate = 0.5",
+    "max_iterations = 50\nfreedom.learning_rate = 0.02" + ROBUST,
 )
 
 
-@pytest.mark.usefixtures("no_results")
 def test_interrupted_deterministic_run_ends_bit_for_bit_as_the_whole(folder, tmp_path):
     whole, output = tmp_path / "whole", tmp_path / "run"
     expected = job(folder, whole, FIFTY).run()
@@ -55,73 +56,31 @@ def test_interrupted_deterministic_run_ends_bit_for_bit_as_the_whole(folder, tmp
     assert 0 < result["cost"]["checkpoint_s"] < result["cost"]["wall_s"]
 
 
-@pytest.mark.usefixtures("no_results")
 def test_what_is_finished_is_not_repeated(folder, whole, tmp_path):
     output, seen = tmp_path / "run", []
-    interrupt(folder, output, "surrogate: random", 7)  # 2 of 2, judged, in the drive
-    interrupt(folder, output, "deployment: attack", 1)
+    interrupt(folder, output, "surrogate: random looks", 3)  # in the second of 2
+    assert len(list(output.glob("looks/*"))) == 1
+    # 2 of each of 5 cases twice, of 2 steps each; in the last
+    interrupt(folder, output, "drives", 2 * 20 - 1)
     before = checkpoint_of(output)
-    written = {path: path.stat().st_mtime_ns for path in output.glob("drives/*")}
-    # 2 of each case twice, but for the last
-    assert len(written) == 18
 
-    def watch(stage, done, total, remark):
-        seen.append((stage, done, remark))
+    def watch(*state):
+        seen.append(state[:3])
 
     document = job(folder, output, on_progress=watch).run()
-    driven = [line for line in seen if line[2] != "kept"]
-    assert driven == [("deployment: attack", k, "") for k in (1, 2, 3, 4)]
-    kept = {stage for stage, _, remark in seen if remark == "kept"}
-    assert kept == {
-        f"{place}: {stage}"
-        for place in ("surrogate", "deployment")
-        for stage in STAGES
-        if (place, stage) != ("deployment", "attack")
-    }
+    job(folder, output, on_progress=watch).run()  # of which nothing is left
+    assert seen == [("drives", 39, 40), ("drives", 40, 40)]
     for name, value in checkpoint_of(output).items():
         assert np.array_equal(value, before[name], equal_nan=True), name
-    assert len(list(output.glob("drives/*"))) == 20
-    assert all(path.stat().st_mtime_ns == time for path, time in written.items())
     # 2 of each case, twice, 2 judged, the attack; drives that were cut short too
     assert document["cost"]["renders"] >= 2 * (10 + 10 + 2) + 6 * 2 * 2
     assert_same_drives(document["drives"], whole[1]["drives"])
 
 
-@pytest.mark.usefixtures("no_results")
-def test_finished_run_is_resumed_without_a_drive(folder, whole, tmp_path):
-    output, seen = tmp_path / "run", []
-    shutil.copytree(whole[0], output)
-
-    def watch(stage, done, total, remark):
-        seen.append(remark)
-
-    job(folder, output, on_progress=watch).run()
-    assert set(seen) == {"kept"}
-
-
-@pytest.mark.usefixtures("no_results")
-def test_interrupt_within_a_step_leaves_a_whole_state(folder, whole, tmp_path):
-    output = tmp_path / "run"
-
-    def press():
-        signal.raise_signal(signal.SIGINT)
-
-    with pytest.raises(KeyboardInterrupt):
-        progress = stop_at("surrogate: optimisation", 4 * 4 + 4, press)
-        job(folder, output, on_progress=progress).run()
-    assert len(checkpoint_of(output)["history"]) == 4
-    job(folder, output).run()
-    assert_same_state(output, whole[0])
-
-
-@pytest.mark.usefixtures("no_results")
 def test_error_within_an_update_keeps_the_checkpoint_before(
     folder, whole, tmp_path, monkeypatch
 ):
-    from mi_nerfattack.attack import gradient
-
-    original = gradient.Adam.step
-    calls = []
+    original, calls = Adam.step, []
 
     def fail_after(self, *arguments, **more):
         original(self, *arguments, **more)
@@ -129,20 +88,16 @@ def test_error_within_an_update_keeps_the_checkpoint_before(
         if len(calls) == 5:
             raise MemoryError
 
-    output = tmp_path / "run"
     with monkeypatch.context() as patch:
-        patch.setattr(gradient.Adam, "step", fail_after)
+        patch.setattr(Adam, "step", fail_after)
         with pytest.raises(MemoryError):
-            job(folder, output).run()
-    assert len(checkpoint_of(output)["history"]) == 3
-    job(folder, output).run()
-    assert_same_state(output, whole[0])
+            job(folder, tmp_path).run()
+    assert len(checkpoint_of(tmp_path)["history"]) == 3
+    job(folder, tmp_path).run()
+    assert_same_state(tmp_path, whole[0])
 
 
-@pytest.mark.usefixtures("no_results")
 def test_gradient_that_is_not_finite_costs_no_iteration(folder, tmp_path, monkeypatch):
-    from mi_nerfattack.rollout.function import Rollout
-
     original, calls = Rollout.gradient, []
 
     def spoil(self, *arguments, **more):
@@ -152,17 +107,27 @@ def test_gradient_that_is_not_finite_costs_no_iteration(folder, tmp_path, monkey
             found.textures[0][:] = float("nan")
         return found
 
-    output = tmp_path / "run"
     monkeypatch.setattr(Rollout, "gradient", spoil)
-    with pytest.raises(InputError, match=r"iteration 5: the gradient of object 0"):
-        job(folder, output).run()
-    monkeypatch.undo()
-    assert len(checkpoint_of(output)["history"]) == 5  # checkpoint_every = 3
-    job(folder, output).run()
-    assert len(checkpoint_of(output)["history"]) == 6
+    with pytest.raises(InputError, match=r"iteration 5: .* object 0"):
+        job(folder, tmp_path).run()
+    assert len(checkpoint_of(tmp_path)["history"]) == 5  # checkpoint_every = 3
 
 
-def test_handlers_of_others_are_not_held(monkeypatch):
+def test_held_interrupt_waits_for_a_good_place():
+    reached = []
+    for count, has_check in ((1, True), (1, False), (2, False)):
+        with pytest.raises(KeyboardInterrupt), held_interrupts() as check:
+            for _ in range(count):
+                signal.raise_signal(signal.SIGINT)
+            reached.append("after the signal")  # of one that waits
+            if has_check:
+                check()
+                reached.append("after the check")
+    assert reached == ["after the signal"] * 2
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_handlers_of_others_are_not_held():
     heard = []
     before = signal.signal(signal.SIGTERM, lambda *_: heard.append("told"))
     try:
@@ -171,25 +136,6 @@ def test_handlers_of_others_are_not_held(monkeypatch):
             assert heard == ["told"]
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-def test_held_interrupt_waits_for_a_good_place():
-    reached = []
-    with pytest.raises(KeyboardInterrupt), held_interrupts() as check:
-        signal.raise_signal(signal.SIGINT)
-        reached.append("after the signal")
-        check()
-        reached.append("after the check")
-    assert reached == ["after the signal"]
-    with pytest.raises(KeyboardInterrupt), held_interrupts():
-        signal.raise_signal(signal.SIGINT)
-        reached.append("no check")
-    with pytest.raises(KeyboardInterrupt), held_interrupts():
-        signal.raise_signal(signal.SIGINT)
-        signal.raise_signal(signal.SIGINT)
-        reached.append("after the second")
-    assert reached == ["after the signal", "no check"]
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_random_generators_go_on_where_they_were():
@@ -208,8 +154,6 @@ def test_random_generators_go_on_where_they_were():
 
 
 def test_deterministic_mode_is_of_one_thread_and_ends():
-    import drjit as dr
-
     before = dr.thread_count(), torch.get_num_threads()
     with determinism.deterministic():
         assert (dr.thread_count(), torch.get_num_threads()) == (1, 1)
@@ -219,20 +163,140 @@ def test_deterministic_mode_is_of_one_thread_and_ends():
 
 
 def test_deterministic_mode_refuses_a_gpu(monkeypatch):
-    import drjit as dr
-
     monkeypatch.setattr(dr, "backend_v", lambda _: dr.JitBackend.CUDA)
     with pytest.raises(SetupError, match="deterministic"), determinism.deterministic():
         pass
 
 
-@pytest.mark.slow
-def test_killed_attacks_go_on(tmp_path):
-    """In an interpreter of its own, since it forks: threads would be lost."""
-    output = tmp_path / "kills.json"
-    arguments = ["--kills", "3", "--seed", "0", "--output", str(output)]
-    command = [sys.executable, "-m", "bench.kill.run", *arguments]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=900)
-    assert result.returncode == 0, result.stdout + result.stderr
-    document = json.loads(output.read_text())
-    assert document["kills"] == 3 and not document["failures"]
+OPTIMISATION = "surrogate: optimisation"
+
+
+def test_changed_scenario_is_refused_with_a_diff_unless_forced(folder, tmp_path):
+    output, notices, first = tmp_path / "run", [], []
+    interrupt(folder, output, OPTIMISATION, 4 * 4 + 1)
+    before = contents(output)
+    change = ("learning_rate = 0.5", "learning_rate = 0.25\njitter = true")
+    line = "scenario.attack.freedom.learning_rate: 0.5 -> 0.25"
+    with pytest.raises(InputError) as refused:
+        job(folder, output, change).run()
+    assert refused.value.where == str(output / "checkpoint.safetensors")
+    assert line in str(refused.value) and "seed" not in str(refused.value)
+    assert "scenario.attack.jitter: false -> true" in str(refused.value)
+    assert "--force" in str(refused.value) and contents(output) == before
+
+    # forced, the attack goes on where it was, and the result says what was ignored
+    def watch(stage, done, total, remark):
+        first.extend([done] * (stage == OPTIMISATION))
+
+    document = job(folder, output, change, watch, notices).run(force=True)
+    assert first[0] == 4 * 4 + 1 and len(checkpoint_of(output)["history"]) == 6
+    assert line in document["ignored_changes"]
+    assert document["curve"] is None  # of two learning rates
+    assert any(line in notice for notice in notices)
+    # from then on the run is that of the changed scenario, its drives too
+    job(folder, output, change).run()
+    with pytest.raises(InputError, match=r"learning_rate: 0\.25 -> 0\.5"):
+        job(folder, output).run()
+
+
+def test_changed_file_and_version_are_named(folder, tmp_path, monkeypatch):
+    output, mine = tmp_path / "run", tmp_path / "mine"
+    shutil.copytree(folder, mine)
+    interrupt(mine, output, OPTIMISATION, 4 * 3 + 1)
+    # a field of another name and place but the same content is the same
+    shutil.copy(mine / "object.safetensors", mine / "copy.safetensors")
+    same = ('"object.safetensors"', '"copy.safetensors"')
+    interrupt(mine, output, OPTIMISATION, 4 * 4 + 1, change=same)
+    tensors, metadata = files.read_safetensors(mine / "object.safetensors")
+    tensors["texture"] = tensors["texture"] + 1
+    files.write_safetensors(mine / "copy.safetensors", tensors, metadata)
+    with pytest.raises(InputError, match=r"objects\[0\]\.field: .*copy\.safetensors"):
+        job(mine, output, same).run()
+    found = module.versions()
+    monkeypatch.setattr(module, "versions", lambda: {**found, "drjit": "0.1"})
+    with pytest.raises(InputError, match=f"drjit: {found['drjit']} -> 0.1"):
+        job(folder, output).run()
+
+
+def test_object_of_another_size_does_not_fit_by_force(folder, tmp_path):
+    interrupt(folder, tmp_path, OPTIMISATION, 4 * 3 + 1)
+    other = ('"object.safetensors"', '"scene.safetensors"')
+    with refused_at(tmp_path / "checkpoint.safetensors"):
+        job(folder, tmp_path, other).run(force=True, anyway=True)
+
+
+def test_scene_counts_with_the_meshes_that_it_names(folder, tmp_path):
+    mine = tmp_path / "mine"
+    shutil.copytree(folder, mine)
+    mesh = mine / "road.ply"
+    mesh.write_text("one")
+    xml = (mine / "deployment.xml").read_text()
+    shape = '<shape type="ply"><string name="filename" value="road.ply"/></shape>'
+    (mine / "deployment.xml").write_text(xml.replace("<emitter", f"{shape}<emitter"))
+    scenario, _ = load_scenario(mine / "scenario.toml")
+    before = scenario.identity()
+    mesh.write_text("other")
+    assert resumable.differences(before, scenario.identity()) == [
+        "scenario.scene.deployment: the content of deployment.xml has changed"
+    ]
+
+
+def test_best_of_another_objective_is_measured_anew(folder, tmp_path):
+    """Seconds in the lane are above minus any sum of distances, which was least."""
+    output = tmp_path / "run"
+    interrupt(folder, output, OPTIMISATION, 4 * 4 + 1)
+    before = checkpoint_of(output)
+    assert before["best_objective"] < 0
+    change = ("[drive]", '[[objective.term]]\nkind = "departure_time"\n[drive]')
+    document = job(folder, output, change).run(force=True)
+    after = checkpoint_of(output)
+    assert np.array_equal(after["history"][:4], before["history"])
+    measured = after["history"][4:, 1]
+    assert (measured > 0).all()
+    assert 0 < after["best_objective"] <= measured.min()
+    assert document["ignored_changes"]
+
+
+def test_version_alone_keeps_the_best(folder, whole, tmp_path, monkeypatch):
+    """The same objective gives the best parameters the value that they had."""
+    output, found, stages = tmp_path / "run", module.versions(), set()
+    shutil.copytree(whole[0], output)
+    before = checkpoint_of(output)
+    monkeypatch.setattr(module, "versions", lambda: {**found, "drjit": "0.1"})
+    job(folder, output, on_progress=lambda *told: stages.add(told[0])).run(force=True)
+    assert "surrogate: best so far" in stages
+    document = job(folder, output).run()  # not measured a second time
+    assert document["cost"]["processes"] == 3
+    for name in ("best.0", "best_objective", "best_mean_m"):
+        assert np.array_equal(checkpoint_of(output)[name], before[name])
+
+
+@pytest.mark.parametrize(
+    ("first", "then"),
+    [("texture", "pose"), ("pose", "both"), ("both", "texture")],
+)
+def test_what_may_change_is_changed_by_force(
+    folder, tmp_path, monkeypatch, first, then
+):
+    seen, work = [], module.Job._attack
+
+    def watch(self, world, *arguments):
+        before = world.appearance()
+        attack = work(self, world, *arguments)
+        seen.append((before, world.appearance(), attack))
+        return attack
+
+    line, output = "deterministic = true", tmp_path / "run"
+    old, new = (f'{line}\nfreedom.kind = "{name}"' for name in (first, then))
+    interrupt(folder, output, OPTIMISATION, 4 * 3 + 1, change=(line, old))
+    monkeypatch.setattr(module.Job, "_attack", watch)
+    job(folder, output, (line, new)).run(force=True)
+    before, after, attack = seen[0]
+    assert attack.iteration == 6
+    assert np.array_equal(after.textures[0], attack.best[0])
+    assert np.array_equal(after.offsets, attack.best_offsets)
+    if then == "texture":
+        assert np.array_equal(after.offsets, before.offsets)
+    if then == "pose":
+        assert np.array_equal(after.textures[0], before.textures[0])
+    assert attack.best_objective <= min(r.objective for r in attack.history[3:])

@@ -1,153 +1,80 @@
-"""Run folders that are new, foreign, damaged, or on a full disk."""
+"""Run folders: foreign, damaged, on a full disk; and the cases that they hold."""
 
 from __future__ import annotations
 
-import errno
 import os
+import re
 import shutil
-import subprocess
-import sys
 
+import numpy as np
 import pytest
-from helpers.attack_jobs import contents, interrupt, job, stop_at
+from support.faults.injected import have_no_space
+from support.faults.refusals import refused_at
+from support.worlds.attacks import contents, job, stop_at
 
 from mi_nerfattack import cli
+from mi_nerfattack.commands.shared.progress import StageBars
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment import results
 from mi_nerfattack.experiment.claim import claimed
-from mi_nerfattack.io import locks
+from mi_nerfattack.io import files, locks
+from mi_nerfattack.rollout.drive import CASES
 
-pytestmark = pytest.mark.usefixtures("variant")
+pytestmark = [pytest.mark.usefixtures("variant", "no_results")]
 
-
-@pytest.mark.usefixtures("no_results")
-@pytest.mark.parametrize("left", ["nothing", "partial", "scenario", "drives"])
-def test_run_killed_early_starts_from_the_beginning(folder, whole, tmp_path, left):
-    output = tmp_path / "run"
-    partial = output / ".scenario.toml.0123456789ab.tmp"
-    if left != "nothing":
-        output.mkdir()
-    if left in ("partial", "scenario"):
-        partial.write_text("half of")
-    if left in ("scenario", "drives"):
-        shutil.copy(whole[0] / "scenario.toml", output)
-    if left == "drives":
-        interrupt(folder, tmp_path / "cut", "surrogate: random", 1)
-        shutil.copytree(tmp_path / "cut" / "drives", output / "drives")
-    job(folder, output).run()
-    assert (output / "metrics.json").exists() and not partial.exists()
+OPTIMISATION = "surrogate: optimisation"
 
 
-def test_numbers_come_without_pictures(folder, whole, tmp_path):
-    output = tmp_path / "run"
-    shutil.copytree(whole[0], output)
-    (output / "metrics.json").unlink()
-    late = job(folder, output)
-    late.frames = None
-    document = late.run()
-    assert document["verdict"] and document["textures"]
-    found = {path.name for path in output.iterdir()} - {
-        path.name for path in whole[0].iterdir()
-    }
-    assert found == {"attack.json", "objects", "steps.csv"}
+def test_a_claimed_folder_is_ours_and_empty_ones_are_removed(tmp_path, capsys):
+    output = tmp_path / "made" / "run"
+    with claimed(output), pytest.raises(InputError, match="another process"):
+        with claimed(output):
+            pass
+    assert not (tmp_path / "made").exists()
+    with claimed(output):
+        (output / "a").write_text("")
+    for path in (output, output / "a"):  # something else than a run, and a file
+        with refused_at(path), claimed(path):
+            pass
+    assert cli.main(["demo", "absent.glb", "-o", str(output)]) == 2
+    assert str(output) in capsys.readouterr().err  # before its object is fitted
+    (output / "scenario.toml").write_text("")
+    (output / "drives").mkdir()
+    with claimed(output):
+        pass
+    assert {path.name for path in output.iterdir()} == {"a", "drives", "scenario.toml"}
 
 
-@pytest.mark.usefixtures("no_results")
-def test_folder_of_something_else_is_left_alone(folder, tmp_path):
-    (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="holds something else than a run"):
+def test_a_scenario_of_which_nothing_was_done_is_replaced_by_force(folder, tmp_path):
+    path, notices = tmp_path / "scenario.toml", []
+    path.write_text("# a scenario of a run killed early")
+    with refused_at(path):
         job(folder, tmp_path).run()
-    (tmp_path / "scenario.toml").write_text("# a scenario of my own")
-    with pytest.raises(InputError, match="holds something else than a run"):
-        job(folder, tmp_path).run()
-    (tmp_path / "alone").mkdir()
-    shutil.move(tmp_path / "scenario.toml", tmp_path / "alone")
-    with pytest.raises(InputError, match=r"scenario\.toml: is another scenario"):
-        job(folder, tmp_path / "alone").run()
-    with pytest.raises(InputError, match="is not a folder"):
-        job(folder, tmp_path / "notes.txt").run()
-    assert len(list(tmp_path.iterdir())) == 2
-    kept = tmp_path / "alone" / "scenario.toml"
-    assert kept.read_text() == "# a scenario of my own"
-
-
-@pytest.mark.usefixtures("no_results")
-def test_scenario_of_which_nothing_was_done_is_replaced_by_force(folder, tmp_path):
-    (tmp_path / "scenario.toml").write_text("# a scenario of a run killed early")
-    notices = []
+    assert path.read_text() == "# a scenario of a run killed early"
     job(folder, tmp_path, notices=notices).run(force=True)
-    assert any("replaced, as told" in notice for notice in notices)
-    assert 'name = "kill"' in (tmp_path / "scenario.toml").read_text()
+    assert any(str(path) in notice for notice in notices)
+    assert 'name = "kill"' in path.read_text()
     assert (tmp_path / "metrics.json").exists()
 
 
-@pytest.mark.usefixtures("no_results")
-def test_two_processes_do_not_work_in_one_folder(folder, tmp_path):
-    output = tmp_path / "run"
-    interrupt(folder, output, "surrogate: optimisation", 4 * 3 + 1)
-    with locks.exclusive(output), pytest.raises(InputError, match="another process"):
-        job(folder, output).run()
-    job(folder, output).run()
-
-
-@pytest.mark.usefixtures("no_results")
-@pytest.mark.parametrize(
-    "name",
-    ["checkpoint.safetensors", "drives/surrogate_own_0000.safetensors"],
-)
-@pytest.mark.parametrize("damage", ["cut", "bit", "foreign"])
-def test_damaged_and_foreign_files_are_refused_by_name(folder, tmp_path, name, damage):
-    output = tmp_path / "run"
-    interrupt(folder, output, "surrogate: optimisation", 4 * 3 + 1)
-    raw = bytearray((output / name).read_bytes())
-    if damage == "foreign":
-        raw = (folder / "object.safetensors").read_bytes()
-    elif damage == "cut":
-        raw = raw[:-7]
-    else:
-        raw[-9] ^= 1
-    (output / name).write_bytes(raw)
-    with pytest.raises(InputError, match=name.replace(".", r"\.")):
-        job(folder, output).run()
-    assert (output / name).read_bytes() == raw
-
-
-@pytest.mark.usefixtures("no_results")
-@pytest.mark.parametrize(
-    ("call", "number"), [("open", errno.EROFS), ("write", errno.ENOSPC)]
-)
-def test_failed_checkpoint_leaves_the_one_before(
-    folder, tmp_path, monkeypatch, call, number
-):
-    output = tmp_path / "run"
-    path = output / "checkpoint.safetensors"
-    original = getattr(os, call)
+def test_failed_checkpoint_leaves_the_one_before(folder, tmp_path, monkeypatch):
+    """The disk fills up after the first checkpoint, of iteration 3."""
     kept = {}
 
-    def fail(*arguments, **more):
-        if call == "open" and not str(arguments[0]).endswith(".tmp"):
-            return original(*arguments, **more)
-        raise OSError(number, os.strerror(number))
-
     def fill():
-        kept.update(contents(output))
-        monkeypatch.setattr(os, call, fail)
+        kept.update(contents(tmp_path))
+        monkeypatch.setattr(os, "write", lambda *_: have_no_space())
 
-    # checkpoint_every = 3: the disk fills up after the first checkpoint
-    progress = stop_at("surrogate: optimisation", 4 * 4, fill)
+    progress = stop_at(OPTIMISATION, 4 * 4, fill)
     with pytest.raises(InputError) as failed:
-        job(folder, output, on_progress=progress).run()
-    monkeypatch.undo()
-    message = str(failed.value)
-    assert str(path) in message and "the same command continues" in message
-    assert ("no space left" if number == errno.ENOSPC else "read-only") in message
-    assert "iteration 6 is not saved" in message
-    assert "checkpoint of iteration 3 is intact" in message
-    assert contents(output) == kept
-    job(folder, output).run()
+        job(folder, tmp_path, on_progress=progress).run()
+    assert failed.value.where == str(tmp_path / "checkpoint.safetensors")
+    for iteration in ("iteration 6", "iteration 3"):  # what is lost, and what is not
+        assert iteration in str(failed.value)
+    assert contents(tmp_path) == kept
 
 
-@pytest.mark.usefixtures("no_results")
-@pytest.mark.parametrize("stage", ["surrogate: own", "surrogate: optimisation"])
+@pytest.mark.parametrize("stage", ["surrogate: own", OPTIMISATION])
 def test_a_refused_attack_leaves_nothing(folder, tmp_path, stage):
     def refuse():
         raise InputError("policy: control nan")
@@ -159,7 +86,6 @@ def test_a_refused_attack_leaves_nothing(folder, tmp_path, stage):
     assert contents(tmp_path) == {} and list(tmp_path.iterdir()) == [output]
 
 
-@pytest.mark.usefixtures("no_results")
 @pytest.mark.parametrize(("step", "cause"), [(3, OSError()), (4 * 2 + 3, None)])
 def test_what_no_other_scenario_mends_is_kept(folder, tmp_path, step, cause):
     """A full disk, and iterations that are done."""
@@ -168,50 +94,10 @@ def test_what_no_other_scenario_mends_is_kept(folder, tmp_path, step, cause):
         raise InputError("disk or gradient") from cause
 
     with pytest.raises(InputError, match="disk or gradient"):
-        stop = stop_at("surrogate: optimisation", step, refuse)
+        stop = stop_at(OPTIMISATION, step, refuse)
         job(folder, tmp_path, on_progress=stop).run()
     seen = {path.name for path in tmp_path.iterdir()}
     assert seen >= {"scenario.toml", "drives"}
-
-
-def test_a_claimed_folder_is_ours_and_empty_ones_are_removed(tmp_path):
-    output = tmp_path / "made" / "run"
-    with claimed(output), pytest.raises(InputError, match="another process"):
-        with claimed(output):
-            pass
-    assert not (tmp_path / "made").exists()
-    with claimed(output):
-        (output / "a").write_text("")
-    with pytest.raises(InputError, match="holds something else than a run"):
-        with claimed(output):
-            pass
-    (output / "scenario.toml").write_text("")
-    (output / "drives").mkdir()
-    with claimed(output):
-        pass
-    with pytest.raises(InputError, match="is not a folder"):
-        with claimed(output / "a"):
-            pass
-    assert {path.name for path in output.iterdir()} == {"a", "drives", "scenario.toml"}
-
-
-def test_a_second_attack_is_refused_before_anything_is_loaded(tmp_path):
-    code = (
-        "import sys\n"
-        "from mi_nerfattack.cli import main\n"
-        "print(main(['attack', 'absent.toml', '-o', '.']), 'torch' in sys.modules)\n"
-    )
-    command = [sys.executable, "-c", code]
-    with locks.exclusive(tmp_path):
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    assert done.stdout == "2 False\n", done.stderr
-    assert "another process works in it" in done.stderr
-
-
-def test_a_demo_is_refused_before_its_object_is_fitted(tmp_path, capsys):
-    (tmp_path / "notes.txt").write_text("mine")
-    assert cli.main(["demo", "-o", str(tmp_path), "--object", "absent.glb"]) == 2
-    assert "holds something else than a run" in capsys.readouterr().err
 
 
 def test_partial_files_of_writers_are_removed_and_no_others(tmp_path):
@@ -225,3 +111,77 @@ def test_partial_files_of_writers_are_removed_and_no_others(tmp_path):
         path.write_text("")
     assert sorted(locks.remove_partial(tmp_path)) == sorted(stale)
     assert all(path.exists() for path in mine)
+
+
+POSES = """\
+freedom.kind = "pose"
+freedom.pose_limit_m = 0.5
+freedom.pose_learning_rate = 0.1"""
+
+
+def test_all_cases_drive_from_the_same_starts(whole):
+    drives = whole[1]["drives"]
+    starts = {}
+    for drive in drives:
+        starts.setdefault(drive.run, []).append(drive.states[0])
+    assert {drive.case for drive in drives} == set(CASES)
+    for found in starts.values():
+        assert len(found) == 10  # five cases in two environments
+        assert np.ptp(found, axis=0).max() == 0
+    assert not np.array_equal(starts[0][0], starts[1][0])
+
+
+def test_best_random_is_the_look_of_least_objective(whole):
+    folder, document = whole
+    drives = {(d.environment, d.case, d.run): d for d in document["drives"]}
+    kept = [files.read_safetensors(p) for p in sorted((folder / "looks").iterdir())]
+    pattern = r'"objective":\s*(-?[\d.e+-]+)'
+    found = [float(re.search(pattern, meta["kept.record"])[1]) for _, meta in kept]
+    assert len(found) == 2 and found[0] != found[1]
+    best = int(np.argmin(found))
+    # of two looks and two starts: look k drives from start k
+    for label in ("surrogate", "deployment"):
+        one, other = (drives[label, case, best] for case in ("random", "best_random"))
+        assert np.array_equal(one.states, other.states)
+
+
+@pytest.mark.usefixtures("no_results")
+def test_random_poses_are_compared_with_attacks_on_poses(folder, tmp_path, monkeypatch):
+    seen = {}
+
+    def only_looks(output, done, *more):
+        seen.update(done.looks)
+        return {}
+
+    monkeypatch.setattr(results, "write_results", only_looks)
+    job(folder, tmp_path / "run", ("iterations = 6", f"iterations = 1\n{POSES}")).run()
+    assert list(seen) == ["no_object", "own", "attack", "random", "best_random"]
+    assert seen["no_object"] is None
+    for case in ("random", "best_random", "attack"):
+        look = seen[case]
+        assert np.array_equal(look.textures[0], seen["own"].textures[0])
+        shift = np.abs(look.offsets[0])
+        assert shift[:2].max() <= 0.5 and not shift[2:5].any()
+        assert case == "attack" or shift[:2].min() > 0
+
+
+@pytest.mark.usefixtures("no_results")
+def test_drives_past_a_lost_attack_count_where_it_finds_the_same(
+    folder, whole, tmp_path
+):
+    output, stages = tmp_path / "run", set()
+    shutil.copytree(whole[0], output)
+    (output / "checkpoint.safetensors").unlink()
+    job(folder, output, on_progress=lambda *told: stages.add(told[0])).run()
+    assert stages == {"surrogate: optimisation"}
+
+
+@pytest.mark.usefixtures("no_results")
+def test_seconds_are_those_since_the_command_began(folder, tmp_path, capsys):
+    change = ("iterations = 6", "iterations = 1")
+    begun = job(folder, tmp_path / "run", change)
+    begun.started -= 1000
+    assert begun.run()["cost"]["wall_s"] > 1000
+    with StageBars(begun.started) as bars:
+        bars.show("attack", 1, 1, "")
+    assert int(capsys.readouterr().err.split()[0]) >= 1000

@@ -6,11 +6,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import small_fields as small
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.faults.refusals import refusals
+from support.worlds import fields as small
 
 from mi_nerfattack.fields import GridField, GridLayout, NGPField, NGPLayout, Occupancy
+from mi_nerfattack.fields.levels import count_read
 from mi_nerfattack.fields.occupancy import MAX_DISTANCE
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -18,25 +20,15 @@ pytestmark = pytest.mark.usefixtures("variant")
 quick = settings(max_examples=20)
 
 
-# Grid
-
-
 def test_grid_equals_float64_interpolation(rng: np.random.Generator) -> None:
     field = small.blob(rng)
-    points = rng.uniform(-0.999, 0.999, (200, 3)).astype(np.float32)
-    density, radiance = small.evaluate(field, points)
-    expected_density, expected_radiance = small.eval_grid(field, points.astype(float))
-    np.testing.assert_allclose(density, expected_density, rtol=2e-5)
-    np.testing.assert_allclose(radiance, expected_radiance, atol=1e-5)
-
-
-def test_grid_is_finite_on_the_corners_of_its_box(rng: np.random.Generator) -> None:
-    field = small.blob(rng)
-    corners = np.array([[(k >> a) & 1 for a in range(3)] for k in range(8)]) * 2.0 - 1
-    density, radiance = small.evaluate(field, corners)
-    expected_density, expected_radiance = small.eval_grid(field, corners)
-    np.testing.assert_allclose(density, expected_density, rtol=1e-3)
-    np.testing.assert_allclose(radiance, expected_radiance, atol=1e-4)
+    inside = rng.uniform(-0.999, 0.999, (200, 3)).astype(np.float32)
+    corners = 2.0 * np.array(list(np.ndindex(2, 2, 2))) - 1
+    for points, rtol, atol in ((inside, 2e-5, 1e-5), (corners, 1e-3, 1e-4)):
+        density, radiance = small.evaluate(field, points)
+        expected = small.eval_grid(field, points.astype(float))
+        np.testing.assert_allclose(density, expected[0], rtol=rtol)
+        np.testing.assert_allclose(radiance, expected[1], atol=atol)
 
 
 def test_raw_zero_is_the_density_scale_and_mid_grey() -> None:
@@ -56,64 +48,49 @@ def test_masked_lanes_are_zero(rng: np.random.Generator) -> None:
         assert (radiance.numpy()[:, 0] == 0).all()
 
 
-@pytest.mark.parametrize("layout", [(3, 5, 12), (1, 7, 7), (4, 16, 33)])
-def test_levels_have_the_cells_that_the_layout_asks_for(layout) -> None:
-    field = GridField(GridLayout(*layout), -small.ONES, small.ONES)
-    for k, level in enumerate(field.levels()):
-        scale = layout[1] * field.layout.growth**k - 1
-        # the encoding has ceil(scale) cells along an edge, up to rounding
-        assert scale - 1e-4 <= level.resolution - 1 < scale + 1 + 1e-4
-    assert field.levels()[0].resolution == layout[1]
-
-
 def test_default_layout_has_the_size_of_the_appendix() -> None:
     field = GridField(GridLayout(), -small.ONES, small.ONES)
     assert 4 * field.n_vertices == pytest.approx(4.4e6, rel=0.02)
     assert field.step_m == pytest.approx(2 / 64)  # a voxel
 
 
-@pytest.mark.parametrize("values", [(0, 16, 64), (33, 16, 64), (4, 1, 8), (4, 9, 8)])
-def test_grid_layout_out_of_range(values: tuple[int, int, int]) -> None:
-    with pytest.raises(ValueError, match="levels|resolutions"):
-        GridLayout(*values)
+def grid(lower=-small.ONES, upper=small.ONES, **numbers: float) -> GridField:
+    return GridField(GridLayout(1, 3, 3), np.array(lower), np.array(upper), **numbers)
 
 
-@pytest.mark.parametrize(
-    ("lower", "upper"),
-    [((0, 0, 0), (1, 1, 0)), ((0, 0, np.nan), (1, 1, 1)), ((0, 0), (1, 1))],
-)
-def test_box_must_be_ordered_and_finite(lower, upper) -> None:
-    with pytest.raises(ValueError, match="bounding box"):
-        GridField(GridLayout(1, 2, 2), np.array(lower), np.array(upper))
-
-
-@pytest.mark.parametrize("name", ["step_m", "density_scale"])
-@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
-def test_grid_numbers_must_be_positive_and_finite(name: str, value: float) -> None:
-    with pytest.raises(ValueError, match=f"{name}: .*positive"):
-        GridField(GridLayout(1, 2, 2), -small.ONES, small.ONES, **{name: value})
-
-
-@pytest.mark.parametrize("values", [{"step_m": 0.0}, {"cone": -0.1}, {"cone": np.nan}])
-def test_ngp_steps_must_make_sense(values: dict[str, float]) -> None:
+def ngp(**numbers: float) -> NGPField:
     layout = NGPLayout(1, 2, 8, 4, 4, 16)
-    with pytest.raises(ValueError, match=next(iter(values))):
-        NGPField(layout, -small.ONES, small.ONES, **values)
+    return NGPField(layout, -small.ONES, small.ONES, **numbers)
 
 
-def test_density_bound_is_tight_where_density_is_constant() -> None:
-    assert small.homogeneous(0.7).density_bound() == pytest.approx(0.7, rel=1e-5)
+test_refused = refusals(
+    (lambda: GridLayout(0, 16, 64), "levels: 0"),
+    (lambda: GridLayout(33, 16, 64), "levels: 33"),
+    (lambda: GridLayout(4, 1, 8), "resolutions: 1"),
+    (lambda: GridLayout(4, 9, 8), "resolutions: 9"),
+    (lambda: GridLayout(32, 256, 512), "levels: 32, from 256 to 512"),
+    (lambda: NGPLayout(32, 8, 24, 1024, 65536), "log2_table: 24"),
+    (lambda: NGPLayout(log2_table=30), "log2_table: 30; allowed are 8 to 24"),
+    (lambda: grid((0, 0, 0), (1, 1, 0)), "bounding box"),
+    (lambda: grid((0, 0, np.nan), (1, 1, 1)), "bounding box"),
+    (lambda: grid((0, 0), (1, 1)), "bounding box"),
+    (lambda: grid(step_m=0.0), "step_m: 0.0"),
+    (lambda: grid(step_m=np.nan), "step_m: nan"),
+    (lambda: grid(density_scale=-1.0), "density_scale: -1.0"),
+    (lambda: grid(density_scale=np.inf), "density_scale: inf"),
+    (lambda: ngp(step_m=0.0), "step_m: 0.0"),
+    (lambda: ngp(cone=-0.1), "cone: -0.1"),
+    (lambda: ngp(cone=np.nan), "cone: nan"),
+    (lambda: grid().set_parameter("texture", np.zeros((5, 3))), r"texture: .*\(5, 3\)"),
+    (lambda: grid().set_parameter("colour", np.zeros((9, 3))), r"colour: .*\(9, 3\)"),
+    (lambda: ngp().set_parameter("table", mi.Float(0)), "table: 1 values"),
+)
 
 
-def test_density_bound_holds_everywhere(rng: np.random.Generator) -> None:
-    field = GridField(small.SMALL, -small.ONES, small.ONES)
-    raw = rng.normal(0, 1, field.n_vertices).astype(np.float32)
-    field.set_parameter("density", raw)
-    points = rng.uniform(-1, 1, (20000, 3))
-    assert small.evaluate(field, points)[0].max() <= field.density_bound()
-
-
-# Parameters of a grid
+def test_parameters_that_a_field_does_not_have() -> None:
+    for make, name, others in ((grid, "hue", "density"), (ngp, "texture", "table")):
+        with pytest.raises(KeyError, match=f"{name}: .*{others}"):
+            make().set_parameter(name, mi.Float(0))
 
 
 def test_packing_and_texture_gradient_are_inverse(rng: np.random.Generator) -> None:
@@ -122,9 +99,10 @@ def test_packing_and_texture_gradient_are_inverse(rng: np.random.Generator) -> N
     density = rng.normal(size=n).astype(np.float32)
     texture = rng.normal(size=(n, 3)).astype(np.float32)
     field.set_parameter("density", density)
-    field.set_parameter("texture", texture)
-    packed = field.packed.numpy().reshape(n, 4)
-    np.testing.assert_array_equal(packed, np.c_[density, texture])
+    for value in (texture, texture.ravel(), mi.TensorXf(texture)):
+        field.set_parameter("texture", value)
+        packed = field.packed.numpy().reshape(n, 4)
+        np.testing.assert_array_equal(packed, np.c_[density, texture])
     np.testing.assert_array_equal(field.texture_gradient(field.packed), texture)
 
 
@@ -140,95 +118,35 @@ def test_texture_gradient_passes_through_set_parameter(rng) -> None:
     np.testing.assert_array_equal(field.texture_gradient(cotangent), expected)
 
 
-def test_flat_and_shaped_textures_are_the_same(rng: np.random.Generator) -> None:
-    field = GridField(GridLayout(1, 3, 3), -small.ONES, small.ONES)
-    texture = rng.normal(size=(field.n_vertices, 3)).astype(np.float32)
-    for value in (texture, texture.ravel(), mi.TensorXf(texture), texture[:, ::1]):
-        field.set_parameter("texture", value)
-        np.testing.assert_array_equal(field.texture, texture)
+def test_the_derivative_of_bricks_by_the_position() -> None:
+    bricks = small.small_bricks(np.random.default_rng(0))
+    # in the first brick, away from the faces of its parts
+    cell = np.argwhere(bricks.occupancy.cells)[0]
+    at = -1 + 2 * (cell + [0.29, 0.41, 0.66]) / bricks.occupancy.shape
+    point, step = mi.Point3f(*at.tolist()), 1e-3
 
+    def density(place):
+        return bricks.eval_everywhere(place, mi.Vector3f(0, 0, 1), mi.Bool(True))[0]
 
-def test_grid_refuses_wrong_parameters() -> None:
-    field = GridField(GridLayout(1, 3, 3), -small.ONES, small.ONES)
-    with pytest.raises(ValueError, match=r"texture: shape \(5, 3\); expected"):
-        field.set_parameter("texture", np.zeros((5, 3), np.float32))
-    with pytest.raises(ValueError, match=r"colour: shape \(26, 3\); expected"):
-        field.set_parameter("colour", dr.full(mi.TensorXf, 0.5, (26, 3)))
-    with pytest.raises(KeyError, match="hue: a grid field has"):
-        field.set_parameter("hue", np.zeros(1, np.float32))
-
-
-# NGP
-
-
-def test_ngp_equals_its_stored_matrices_in_float64(rng: np.random.Generator) -> None:
-    field = small.small_ngp()
-    points = rng.uniform(-1, 1, (50, 3)).astype(np.float32)
-    heading = np.array([2.0, -1.0, 2.0]) / 3
-    density, radiance = small.evaluate(field, points, heading)
-
-    stored = field.tensors()
-    unit = mi.Point3f(((points.T + 1) / 2).copy())
-    h = np.array([x.numpy() for x in field.encoding(unit, mi.Bool(True))], float)
-    for index in range(2):
-        h = stored[f"density_net.{index}"] @ (np.maximum(h, 0) if index else h)
-    harmonics = dr.sh_eval(mi.Vector3f(*map(float, heading)), 3)
-    sphere = [float(mi.Float(x)[0]) for x in harmonics]
-    c = np.concatenate([h, np.tile(np.array(sphere)[:, None], 50)])
-    for index in range(3):
-        c = stored[f"colour_net.{index}"] @ (np.maximum(c, 0) if index else c)
-    np.testing.assert_allclose(density, np.exp(h[0]) / 2, rtol=1e-4)
-    np.testing.assert_allclose(radiance, small.sigmoid_to_linear(c).T, atol=1e-5)
-    alone = field.density(mi.Point3f(points.T.copy()), mi.Bool(True))
-    np.testing.assert_allclose(alone.numpy(), density, rtol=1e-5)
+    dr.enable_grad(point)
+    dr.backward(density(point))
+    for axis in range(3):
+        offset = mi.Point3f([step * (k == axis) for k in range(3)])
+        ends = [density(dr.detach(point) + s * offset) for s in (1, -1)]
+        expected = float((ends[0] - ends[1])[0]) / (2 * step)
+        assert expected != 0
+        assert float(dr.grad(point)[axis][0]) == pytest.approx(expected, rel=2e-2)
 
 
 def test_ngp_radiance_depends_on_direction_but_density_does_not() -> None:
     field, points = small.small_ngp(), np.full((1, 3), 0.3)
-    there, back = (
-        small.evaluate(field, points),
-        small.evaluate(field, points, (0, 0, -1)),
-    )
+    there, back = (small.evaluate(field, points, (0, 0, z)) for z in (1, -1))
     assert there[0] == back[0]
     assert np.abs(there[1] - back[1]).max() > 1e-3
 
 
-def sky_direction(row: float, column: float, height: int, width: int) -> mi.Vector3f:
-    """Return the direction of a place in the sky's image, in texels."""
-    phi, theta = 2 * np.pi * column / width, np.pi * (row + 0.5) / height
-    sine = np.sin(theta)
-    x, y, z = sine * np.cos(phi), sine * np.sin(phi), np.cos(theta)
-    return mi.Vector3f(float(x), float(y), float(z))
-
-
-def test_sky_is_exact_on_texels_and_linear_between() -> None:
-    field = small.small_ngp()
-    height, width = field.sky_shape
-    raw = field.sky.numpy().reshape(height, width, 3).astype(float)
-    for row, column in [(0, 0), (1, 3), (3, 7)]:
-        seen = field.background(sky_direction(row, column, height, width))
-        expected = small.sigmoid_to_linear(raw[row, column])
-        np.testing.assert_allclose(seen.numpy()[:, 0], expected, atol=1e-4)
-    seam = field.background(sky_direction(1, width - 0.5, height, width))
-    expected = small.sigmoid_to_linear((raw[1, -1] + raw[1, 0]) / 2)
-    np.testing.assert_allclose(seam.numpy()[:, 0], expected, atol=1e-4)
-
-
 def test_grid_has_a_black_background(rng: np.random.Generator) -> None:
     assert (small.blob(rng).background(mi.Vector3f(0, 0, 1)).numpy() == 0).all()
-
-
-def test_ngp_refuses_wrong_parameters() -> None:
-    field = small.small_ngp()
-    with pytest.raises(KeyError, match="texture: an NGP has table"):
-        field.set_parameter("texture", mi.Float(0))
-    with pytest.raises(ValueError, match="table: 1 values; expected"):
-        field.set_parameter("table", mi.Float(0))
-    with pytest.raises(ValueError, match="log2_table: 30; allowed are 8 to 24"):
-        NGPLayout(log2_table=30)
-
-
-# Occupancy
 
 
 def brute_distance(cells: np.ndarray) -> np.ndarray:
@@ -303,8 +221,7 @@ def test_empty_octants_of_occupied_cells(rng) -> None:
 
 
 def test_occupancy_clamps_positions_outside() -> None:
-    cells = np.zeros((2, 2, 2), bool)
-    cells[1, 1, 1] = True
+    cells = np.arange(8).reshape(2, 2, 2) == 7
     outside = mi.Point3f([-3, 4], [-3, 4], [-3, 4])
     distance, cell = Occupancy(cells).query(outside, mi.Bool(True))
     np.testing.assert_array_equal(distance.numpy(), [1, 0])
@@ -312,10 +229,82 @@ def test_occupancy_clamps_positions_outside() -> None:
 
 
 def test_occupancy_fraction_and_shape() -> None:
-    cells = np.zeros((2, 3, 4), bool)
-    cells[0] = True
-    assert Occupancy(cells).fraction == 0.5
-    assert Occupancy(cells).shape == (2, 3, 4)
+    half = Occupancy(np.repeat([True, False], 12).reshape(2, 3, 4))
+    assert (half.fraction, half.shape) == (0.5, (2, 3, 4))
     assert Occupancy.full(3).fraction == 1
-    with pytest.raises(ValueError, match="occupancy: shape"):
+    with pytest.raises(ValueError, match=r"occupancy: shape \(2, 2\)"):
         Occupancy(np.ones((2, 2), bool))
+
+
+LAYOUTS = [(1, 2, 2), (1, 3, 3), (2, 3, 4), (3, 4, 12), (5, 6, 6), (16, 16, 64)]
+
+
+@pytest.mark.parametrize("numbers", LAYOUTS)
+def test_levels_are_those_of_the_encoding(numbers: tuple[int, int, int]) -> None:
+    field = GridField(GridLayout(*numbers), -small.ONES, small.ONES)
+    assert 4 * field.n_vertices == field.encoding.n_params
+    for index, level in enumerate(field.levels()):
+        start, resolution, scale = small.level_vertices(field, index)
+        assert (level.scale, level.resolution) == (scale, resolution)
+        assert level.vertices == slice(start, start + resolution**3)
+
+
+@pytest.mark.parametrize("features", [2, 4, 8])
+def test_size_of_a_hashed_table(features: int) -> None:
+    layout = NGPLayout(6, features, 10, 4, 33, 16)
+    field = NGPField(layout, -small.ONES, small.ONES)
+    assert layout.n_params == field.encoding.n_params
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (3, 2, 4), (20, 1, 7)])
+def test_read_vertices_are_the_corners_of_cells_with_points(shape, rng) -> None:
+    field = GridField(GridLayout(3, 4, 11), -small.ONES, small.ONES)
+    cells = rng.random(shape) < 0.4
+    cells[0, 0, 0] = True
+    field.occupy(Occupancy(cells))
+    held, expected = field.held_vertices(), np.zeros(field.n_vertices, bool)
+    places = np.argwhere(cells)[rng.integers(cells.sum(), size=20000)]
+    unit = (places + rng.random((20000, 3))) / shape
+    for level in field.levels():
+        low = np.floor(unit * level.scale).astype(int)
+        for corner in np.ndindex(2, 2, 2):
+            x, y, z = np.minimum(low + corner, level.resolution - 1).T
+            n = level.resolution
+            expected[level.vertices.start + x + n * (y + n * z)] = True
+    assert not (expected & ~held).any()
+    assert held.sum() == count_read(field.levels(), cells)
+    assert held.sum() <= 1.3 * expected.sum() + 9  # and few others, at faces
+
+
+def crossings(field: GridField) -> np.ndarray:
+    """Return where planes of vertices meet in occupied cells, (n, 3) of the box."""
+    planes = [np.arange(x.resolution) / x.scale for x in field.levels()]
+    found = []
+    for cell in np.argwhere(field.window.cells):
+        edges = np.array([cell, cell + 1]) / field.window.cells.shape
+        places = [
+            [x for x in np.unique(np.concatenate([*planes, edge])) if a <= x <= b]
+            for edge, a, b in zip(edges.T, *edges, strict=True)
+        ]
+        found.append(np.stack(np.meshgrid(*places), -1).reshape(-1, 3))
+    return np.concatenate(found)
+
+
+@pytest.mark.parametrize("layout", [GridLayout(4, 3, 9), GridLayout(1, 6, 6)])
+@pytest.mark.parametrize("shape", [(1, 1, 1), (2, 3, 5), (40, 3, 2)])
+def test_the_bound_is_the_largest_density_of_a_random_field(layout, shape, rng) -> None:
+    field = GridField(layout, np.array([-1.0, -2, 0]), small.ONES, density_scale=0.3)
+    cells = rng.random(shape) < 0.5
+    cells[0, 0, 0] = True
+    field.occupy(Occupancy(cells))
+    for _ in range(2):  # a changed density has another bound
+        raw = rng.normal(0, 1, field.n_vertices).astype(np.float32)
+        field.set_parameter("density", raw)
+        points = field.lower + crossings(field) * (field.upper - field.lower)
+        expected = small.eval_grid(field, points)[0].max()
+        assert field.density_bound() == pytest.approx(expected, rel=1e-5)
+    before = field.density_bound()
+    field.occupy(Occupancy(np.arange(cells.size).reshape(shape) == 0))
+    assert field.density_bound() <= before
+    field.occupy(Occupancy(np.zeros(shape, bool)))
+    assert field.density_bound() == 0

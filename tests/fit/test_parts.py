@@ -8,8 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import small_fields as small
-from helpers.sphere_views import (
+from support.faults.refusals import refusals
+from support.worlds.views import (
     RADIUS,
     SIZE,
     mixed_views,
@@ -21,54 +21,40 @@ from helpers.sphere_views import (
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy, srgb_to_linear_numpy
 from mi_nerfattack.capture.inputs import find_bounds, read_depth
 from mi_nerfattack.capture.posed_images import PosedImages
-from mi_nerfattack.errors import InputError
-from mi_nerfattack.fit.loss import LossWeights, huber, loss_and_cotangent
+from mi_nerfattack.fit.loss import LossWeights, loss_and_cotangent
 from mi_nerfattack.fit.rays import RayBank, RayBatch
 from mi_nerfattack.fit.scores import compare
 from mi_nerfattack.render.camera.intrinsics import from_fov, look_at
-from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.rays import March, Rays
-from mi_nerfattack.render.walk import sample_count
+from mi_nerfattack.render.rays import March
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 
-def test_batch_holds_the_rays_and_values_of_its_pixels():
-    images, depth = sphere_views(3)
-    bank = RayBank(images, np.array([2, 1]), depth)
-    row, column = 13, 7
-    batch = bank.batch(mi.UInt32(SIZE * SIZE + row * SIZE + column))
-    expected = world_rays(images.camera, images.camera_to_world[1])[row, column]
-    np.testing.assert_allclose(batch.direction.numpy()[:, 0], expected, atol=1e-6)
-    np.testing.assert_allclose(
-        batch.origin.numpy()[:, 0], images.camera_to_world[1, :3, 3], atol=1e-6
-    )
-    values = np.append(batch.colour.numpy()[:, 0], batch.alpha.numpy()[0])
-    np.testing.assert_allclose(255 * values, images.images[1, row, column], atol=1e-4)
-    assert batch.depth.numpy()[0] == depth[1, row, column]
-
-
-def test_batch_of_images_of_several_sizes():
-    images, depth = mixed_views(4, alpha=False)
+@pytest.mark.parametrize("alpha", [False, True])
+def test_batch_holds_the_rays_and_values_of_images_of_several_sizes(alpha):
+    images, depth = mixed_views(4, alpha)
     chosen = np.array([3, 2, 0])
     bank = RayBank(images, chosen, depth)
-    assert bank.count == sum(images.images[i][..., 0].size for i in chosen)
     batch = bank.batch(dr.arange(mi.UInt32, bank.count))
-    rays = [
-        world_rays(images.camera_of(i), images.camera_to_world[i]).reshape(-1, 3)
-        for i in chosen
-    ]
-    np.testing.assert_allclose(
-        batch.direction.numpy().T, np.concatenate(rays), atol=1e-6
-    )
-    shown = np.concatenate([images.images[i].reshape(-1, 3) for i in chosen])
-    np.testing.assert_allclose(255 * batch.colour.numpy().T, shown, atol=1e-4)
-    known = np.concatenate([depth[i].ravel() for i in chosen])
-    np.testing.assert_array_equal(batch.depth.numpy(), known)
-    places = np.repeat(np.arange(3), [len(r) for r in rays])
-    np.testing.assert_array_equal(batch.image.numpy(), places)
-    with pytest.raises(InputError, match="depth: shape"):
-        RayBank(images, chosen, depth[::-1])
+    rays, eyes, shown, known, places = [], [], [], [], []
+    for place, i in enumerate(chosen):
+        ray = world_rays(images.camera_of(i), images.camera_to_world[i]).reshape(-1, 3)
+        rays.append(ray)
+        eyes.append(np.broadcast_to(images.camera_to_world[i, :3, 3], ray.shape))
+        shown.append(images.images[i].reshape(len(ray), -1))
+        known.append(depth[i].ravel())
+        places.append(np.full(len(ray), place))
+    found = batch.colour.numpy().T
+    if alpha:
+        found = np.c_[found, batch.alpha.numpy()]
+    for value, expected, atol in (
+        (batch.direction.numpy().T, rays, 1e-6),
+        (batch.origin.numpy().T, eyes, 1e-6),
+        (255 * found, shown, 1e-4),
+        (batch.depth.numpy(), known, 0),
+        (batch.image.numpy(), places, 0),
+    ):
+        np.testing.assert_allclose(value, np.concatenate(expected), rtol=0, atol=atol)
 
 
 def test_box_restricts_the_pixels_drawn():
@@ -78,24 +64,6 @@ def test_box_restricts_the_pixels_drawn():
     batch = bank.batch(bank.draw(mi.PCG32(512)))
     closest = dr.norm(dr.cross(mi.Vector3f(batch.origin), batch.direction)).numpy()
     assert closest.max() <= 0.05 * np.sqrt(3) + 1e-6
-
-
-def test_box_out_of_sight_is_an_error():
-    images, _ = sphere_views(2)
-    with pytest.raises(InputError, match="bounds"):
-        RayBank(images, np.arange(1), box=(np.full(3, 50.0), np.full(3, 51.0)))
-
-
-def test_depth_of_another_shape_is_an_error():
-    images, depth = sphere_views(2)
-    with pytest.raises(InputError, match="depth: shape"):
-        RayBank(images, np.arange(2), depth[:1])
-
-
-def test_huber_is_quadratic_then_linear():
-    error = mi.Float([-0.05, 0.1, 0.5])
-    expected = [0.05**2 / 0.2, 0.05, 0.45]
-    np.testing.assert_allclose(huber(error, 0.1).numpy(), expected, rtol=1e-6)
 
 
 def loss_reference(values: np.ndarray, ray: dict, weights: LossWeights) -> float:
@@ -120,26 +88,19 @@ def loss_reference(values: np.ndarray, ray: dict, weights: LossWeights) -> float
 @pytest.mark.parametrize("alpha", [0.0, 0.4, 1.0])
 def test_cotangent_is_the_losss_derivative(depth, alpha):
     weights = LossWeights(0.05, 0.3, 0.2)
-    ray = {
-        "background": np.array([0.1, 0.3, 0.6]),
-        "colour": np.array([0.5, 0.2, 0.9]),
-        "alpha": alpha,
-        "depth": depth,
-    }
+    sky, colour = np.array([0.1, 0.3, 0.6]), np.array([0.5, 0.2, 0.9])
+    ray = {"background": sky, "colour": colour, "alpha": alpha, "depth": depth}
     values = np.array([0.3, 0.2, 0.15, 0.7, 1.75])
-    zero = mi.Point3f(0)
+    primal = March(mi.Color3f(values[:3].tolist()), mi.Float(0.7), mi.Float(1.75))
     batch = RayBatch(
-        zero,
+        mi.Point3f(0),
         mi.Vector3f(0, 0, 1),
-        mi.Color3f(ray["colour"].tolist()),
+        mi.Color3f(colour.tolist()),
         mi.Float(alpha),
         mi.Float(depth),
     )
-    primal = March(mi.Color3f(values[:3].tolist()), mi.Float(0.7), mi.Float(1.75))
-    background = mi.Color3f(ray["background"].tolist())
-    loss, _, cotangent = loss_and_cotangent(
-        primal, background, batch, weights, mi.Float(1)
-    )
+    sky = mi.Color3f(sky.tolist())
+    loss, _, cotangent = loss_and_cotangent(primal, sky, batch, weights, mi.Float(1))
     assert loss[0] == pytest.approx(loss_reference(values, ray, weights), rel=1e-3)
     parts = (cotangent.radiance.numpy(), cotangent.opacity, cotangent.moment)
     found = np.concatenate([np.ravel(part) for part in parts])
@@ -148,36 +109,33 @@ def test_cotangent_is_the_losss_derivative(depth, alpha):
         assert found[i] == pytest.approx((high - low) / 2e-6, rel=2e-3, abs=1e-5)
 
 
-def test_loss_of_white_before_white_still_has_a_derivative():
-    batch = RayBatch(
-        mi.Point3f(0), mi.Vector3f(0, 0, 1), mi.Color3f(0.5), mi.Float(1), None
-    )
-    primal = March(mi.Color3f(1), mi.Float(1), mi.Float(1))
-    cotangent = loss_and_cotangent(
-        primal, mi.Color3f(0), batch, LossWeights(), mi.Float(1)
-    )[2]
-    assert cotangent.radiance.numpy().min() > 0.1
-
-
-def test_bounds_given_must_be_in_order():
-    images, _ = sphere_views(2)
-    lower, upper = find_bounds(images, None, (0, 0, 0, 1, 2, 3))
-    assert lower.tolist() == [0, 0, 0] and upper.tolist() == [1, 2, 3]
-    with pytest.raises(InputError, match="bounds"):
-        find_bounds(images, None, (0, 0, 0, 1, 0, 1))
+def test_derivatives_where_depth_is_unknown_and_where_white_would_be_clipped():
+    unknown = mi.Float([np.nan, np.nan, 2.0])
+    primal = March(mi.Color3f(1), mi.Float([0.4, 0.9, 0.4]), mi.Float([0.7, 0.2, 0.7]))
+    towards, colour = mi.Vector3f(0, 0, 1), mi.Color3f(0.5)
+    batch = RayBatch(mi.Point3f(0), towards, colour, mi.Float(1), unknown)
+    weights, black = LossWeights(depth=10.0, opacity=10.0), mi.Color3f(0)
+    loss, _, found = loss_and_cotangent(primal, black, batch, weights, mi.Float(1))
+    assert np.isfinite(loss.numpy()).all()
+    assert found.radiance.numpy().min() > 0.1
+    for values in (found.opacity, found.moment):
+        assert (values.numpy() != 0).tolist() == [False, False, True]
 
 
 def test_bounds_around_the_point_that_cameras_look_at():
-    images, _ = sphere_views(12)
-    lower, upper = find_bounds(images)
-    np.testing.assert_allclose(lower, -3.2, atol=1e-6)
-    np.testing.assert_allclose(upper, 3.2, atol=1e-6)
+    images, depth = sphere_views(12)
+    for known in (None, np.full_like(depth, np.nan)):
+        found = find_bounds(images, known)
+        np.testing.assert_allclose(found, [[-3.2] * 3, [3.2] * 3], atol=1e-6)
 
 
-def test_bounds_around_the_points_that_depth_shows():
+def test_depth_and_given_bounds_win_over_points():
     images, depth = sphere_views(60)
-    lower, upper = find_bounds(images, depth)
+    posed = replace(images, points=np.full((5, 3), 40.0))
+    lower, upper = find_bounds(posed, depth)
     np.testing.assert_allclose(upper - lower, 2 * (RADIUS + 0.05), atol=0.02)
+    found = find_bounds(posed, depth, (0, 0, 0, 1, 2, 3))
+    np.testing.assert_array_equal(found, [[0, 0, 0], [1, 2, 3]])
 
 
 def test_bounds_hold_a_step_of_the_march_behind_what_is_far():
@@ -185,20 +143,6 @@ def test_bounds_hold_a_step_of_the_march_behind_what_is_far():
     images = PosedImages(np.zeros((1, 8, 8, 3), np.uint8), pose[None], camera, ("a",))
     upper = find_bounds(images, np.full((1, 8, 8), 45, np.float32))[1]
     assert upper[0] == pytest.approx(45 + 45 / 128, abs=0.01)
-
-
-def test_bounds_where_no_depth_is_known_are_those_without_depth():
-    images, depth = sphere_views(12)
-    lower, upper = find_bounds(images, np.full_like(depth, np.nan))
-    assert [lower.tolist(), upper.tolist()] == [b.tolist() for b in find_bounds(images)]
-
-
-def test_bounds_of_parallel_cameras_are_asked_for():
-    camera = from_fov(4, 4, 90.0)
-    poses = np.stack([look_at(np.array([x, 0.0, 1.0]), [x + 1, 0, 1]) for x in (0, 1)])
-    images = PosedImages(np.zeros((2, 4, 4, 3), np.uint8), poses, camera, ("a", "b"))
-    with pytest.raises(InputError, match="--bounds"):
-        find_bounds(images)
 
 
 def test_depth_is_read_at_the_images_size(tmp_path):
@@ -210,32 +154,54 @@ def test_depth_is_read_at_the_images_size(tmp_path):
     np.testing.assert_array_equal(read_depth(tmp_path, small), depth[:, 1::2, 1::2])
 
 
-@pytest.mark.parametrize("fault", ["count", "zero"])
-def test_depth_that_does_not_fit_is_an_error(tmp_path, fault):
-    depth = sphere_views(4)[1]
-    depth = depth[:3] if fault == "count" else np.where(depth > 9, 0, depth)
-    images = write_folder(tmp_path, np.ascontiguousarray(depth, np.float32))
-    with pytest.raises(InputError, match="depth.safetensors"):
-        read_depth(tmp_path, images)
-
-
-def test_samples_are_counted_by_the_cells_that_rays_cross():
-    grid, origin, direction = small.half_occupied()
-    count = sample_count(PosedField(grid), Rays(origin, direction))
-    assert count.numpy().tolist() == [4, 2, 0]
-
-
 def test_masked_pixels_are_not_drawn():
+    images, masks = masked()
+    bank = RayBank(replace(images, masks=masks), np.array([0, 1]))
+    drawn = bank.draw(mi.PCG32(4000, 1)).numpy()
+    wanted = np.ravel_multi_index((1, 4, np.arange(5, 8)), (2, *masks.shape[1:]))
+    assert sorted(set(drawn.tolist())) == wanted.tolist()
+
+
+def masked() -> tuple[PosedImages, np.ndarray]:
+    """Return three views, and masks that leave pixels of the second alone."""
     images, _ = sphere_views(3)
     masks = np.zeros(images.images.shape[:3], bool)
     masks[1, 4, 5:8] = True
-    shape, indices = masks.shape[1:], np.array([0, 1])
-    bank = RayBank(replace(images, masks=masks), indices)
-    drawn = bank.draw(mi.PCG32(4000, 1)).numpy()
-    wanted = np.ravel_multi_index((1, 4, np.arange(5, 8)), (2, *shape))
-    assert sorted(set(drawn.tolist())) == wanted.tolist()
-    with pytest.raises(InputError, match="masks: leave no pixel"):
-        RayBank(replace(images, masks=masks), np.array([0, 2]))
+    return images, masks
+
+
+def parallel() -> PosedImages:
+    """Two cameras that look in one direction."""
+    poses = np.stack([look_at(np.array([x, 0.0, 1.0]), [x + 1, 0, 1]) for x in (0, 1)])
+    pixels, lens = np.zeros((2, 4, 4, 3), np.uint8), from_fov(4, 4, 90.0)
+    return PosedImages(pixels, poses, lens, ("a", "b"))
+
+
+def bank(**changes) -> RayBank:
+    images, masks = masked()
+    if changes.pop("masks", None) is not None:
+        images = replace(images, masks=masks)
+    return RayBank(images, np.array([0, 2]), **changes)
+
+
+def depth_file(change):
+    def call(folder) -> None:
+        depth = np.ascontiguousarray(change(sphere_views(4)[1]), np.float32)
+        read_depth(folder, write_folder(folder, depth))
+
+    return call
+
+
+FAR = np.full(3, 50.0), np.full(3, 51.0)
+test_refused = refusals(
+    (lambda: bank(box=FAR), "bounds"),
+    (lambda: bank(depth=sphere_views(2)[1]), "depth: shape"),
+    (lambda: bank(masks=True), "masks: leave no pixel"),
+    (lambda: find_bounds(parallel()), "camera poses: .*--bounds"),
+    (lambda: find_bounds(parallel(), None, (0, 0, 0, 1, 0, 1)), "bounds: .*x0 y0"),
+    (depth_file(lambda depth: depth[:3]), r"depth.safetensors: .*\(3, "),
+    (depth_file(lambda depth: np.where(depth > 9, 0, depth)), "depth.safetensors: "),
+)
 
 
 def test_masked_pixels_are_not_scored():
@@ -245,8 +211,7 @@ def test_masked_pixels_are_not_scored():
     mask = np.ones((24, 30), bool)
     mask[14:] = False
     psnr, ssim = compare(image, other)
-    wrong = other.copy()
-    wrong[~mask] = 1 - image[~mask]
+    wrong = np.where(mask[..., None], other, 1 - image)
     masked = compare(image, wrong, mask)
     assert masked[0] == pytest.approx(compare(image[:14], other[:14])[0])
     assert masked[1] > ssim - 0.02 and compare(image, wrong)[0] < psnr - 5

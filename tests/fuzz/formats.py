@@ -9,12 +9,12 @@ import json
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from fuzz import programs
+from fuzz import exchanges, programs
 from fuzz.mutations import (
     Mutation,
     of_bytes,
@@ -29,22 +29,15 @@ from fuzz.mutations import (
 Read = Callable[[Path], Any]
 
 
-@dataclass(frozen=True)
-class Format:
-    """A format.
-
-    Args:
-        prepare: write good files into a folder, and return those to damage with what
-            reads each.
-        mutate: damage the content.
-    """
+class Format(NamedTuple):
+    """What writes good files into a folder and returns each with its reader; damage."""
 
     prepare: Callable[[Path], list[tuple[Path, Read]]]
     mutate: Mutation
 
 
 def _scenario(folder: Path) -> list[tuple[Path, Read]]:
-    from helpers.scenario_text import HEAD, write_named_files
+    from support.files.runs import HEAD, write_named_files
 
     from mi_nerfattack.scenario.scenario import load_scenario
 
@@ -55,11 +48,8 @@ def _scenario(folder: Path) -> list[tuple[Path, Read]]:
 
 
 def _grid(folder: Path) -> list[tuple[Path, Read]]:
-    from helpers.scenario_text import HEAD, write_named_files
+    from support.files.runs import HEAD, write_named_files
 
-    from mi_nerfattack import variant
-
-    variant.ensure()
     from mi_nerfattack.experiment.sweep.grid import load_cells
 
     write_named_files(folder)
@@ -73,13 +63,13 @@ def _grid(folder: Path) -> list[tuple[Path, Read]]:
         'set.drive.length_m = 5\n[[objects]]\nname = "hydrant"\nroutes = ["lane"]\n'
         '[[objects.set.objects]]\nid = "a"\nfield = "object.safetensors"\n'
         'position_m = [1, 2, 0]\n[[methods]]\nname = "blocks"\n'
-        'set.attack.method = "blocks"\n[[methods]]\nname = "gradient"\n'
+        'set.attack.method.kind = "blocks"\n[[methods]]\nname = "gradient"\n'
     )
     return [(path, load_cells)]
 
 
 def _motor(folder: Path) -> list[tuple[Path, Read]]:
-    from mi_nerfattack.robot.vesc import calibration
+    from mi_nerfattack.car.vesc import calibration
 
     path = folder / "car.toml"
     calibration.write_calibration(path, calibration.Calibration())
@@ -87,7 +77,6 @@ def _motor(folder: Path) -> list[tuple[Path, Read]]:
 
 
 def _policy_toml(folder: Path) -> list[tuple[Path, Read]]:
-    from mi_nerfattack.commands.shared.evaluate_options import PolicyOptions
     from mi_nerfattack.commands.shared.policy_file import PolicyFile
 
     path = folder / "policy.toml"
@@ -98,33 +87,27 @@ def _policy_toml(folder: Path) -> list[tuple[Path, Read]]:
     )
 
     def read(path: Path) -> None:
-        PolicyFile.read(str(path))
-        PolicyOptions().section(str(path)).build()
+        PolicyFile.read(str(path)).section.build()
 
     return [(path, read)]
 
 
 def _field(folder: Path) -> list[tuple[Path, Read]]:
-    from mi_nerfattack import variant
-
-    variant.ensure()
-    from helpers.small_fields import blob, small_bricks, small_ngp
+    from support.worlds.fields import blob, small_bricks, small_ngp
 
     from mi_nerfattack.fields.io import load_field, save_field
 
-    save_field(folder / "grid.safetensors", blob(np.random.default_rng(0)))
-    save_field(folder / "ngp.safetensors", small_ngp())
-    save_field(folder / "bricks.safetensors", small_bricks(np.random.default_rng(0)))
-
-    def read(path: Path) -> None:
-        load_field(path).metadata()
-
-    kinds = ("grid", "ngp", "bricks")
-    return [(folder / f"{kind}.safetensors", read) for kind in kinds]
+    rng = np.random.default_rng(0)
+    paths = [folder / f"{kind}.safetensors" for kind in ("grid", "ngp", "bricks")]
+    for path, field in zip(
+        paths, (blob(rng), small_ngp(), small_bricks(rng)), strict=True
+    ):
+        save_field(path, field)
+    return [(path, lambda path: load_field(path).metadata()) for path in paths]
 
 
 def _gltf(folder: Path) -> list[tuple[Path, Read]]:
-    from helpers.mesh_samples import four_colours, plate
+    from support.files.objects import four_colours, plate
 
     gltf = plate()
     texture = {"index": gltf.texture(four_colours(), wrapS=33071, wrapT=33071)}
@@ -135,7 +118,7 @@ def _gltf(folder: Path) -> list[tuple[Path, Read]]:
 
 
 def _gltf_text(folder: Path) -> list[tuple[Path, Read]]:
-    from helpers.mesh_samples import plate
+    from support.files.objects import plate
 
     gltf = plate(COLOR_0=np.full((4, 3), 0.5))
     gltf.material(baseColorFactor=[1, 0.5, 1, 1])
@@ -144,7 +127,7 @@ def _gltf_text(folder: Path) -> list[tuple[Path, Read]]:
 
 
 def _obj(folder: Path) -> list[tuple[Path, Read]]:
-    from helpers.mesh_samples import four_colours
+    from support.files.objects import four_colours
 
     four_colours().save(folder / "four.png")
     (folder / "plate.mtl").write_text("newmtl a\nKd 0.5 0.25 1\nmap_Kd four.png\n")
@@ -173,7 +156,7 @@ def _read_mesh(path: Path) -> None:
 
 
 def _splats(folder: Path) -> list[tuple[Path, Read]]:
-    from helpers.splat_files import cloud, columns, write_ply
+    from support.files.objects import cloud, columns, write_ply
 
     from mi_nerfattack.fields.splats import read_splats
 
@@ -182,6 +165,28 @@ def _splats(folder: Path) -> list[tuple[Path, Read]]:
         (write_ply(folder / f"{text}.ply", values, text), read_splats)
         for text in (False, True)
     ]
+
+
+def _compact_splats(folder: Path, name: str) -> list[tuple[Path, Read]]:
+    import gzip
+
+    import mitsuba as mi
+    from support.files import compact, objects
+
+    from mi_nerfattack.fields.compact_splats import load_splats
+
+    mi.set_variant("llvm_ad_rgb")
+    item, path = objects.cloud(np.random.default_rng(0), 3), folder / f"a.{name}"
+    path.write_bytes(getattr(compact, name)(item))
+
+    def read(path: Path) -> None:
+        if name == "spz":  # what is damaged is packed, or few inputs pass a checksum
+            packed = path.with_name("packed.spz")
+            packed.write_bytes(gzip.compress(path.read_bytes(), 1))
+            path = packed
+        load_splats(path)
+
+    return [(path, read)]
 
 
 def _png(folder: Path) -> list[tuple[Path, Read]]:
@@ -227,7 +232,7 @@ def _exr(folder: Path) -> list[tuple[Path, Read]]:
 
 
 def _transforms(folder: Path) -> list[tuple[Path, Read]]:
-    from helpers import foreign_folders
+    from support.files import folders as foreign_folders
 
     from mi_nerfattack.capture.camera_path import read_path
     from mi_nerfattack.capture.inputs import read_depth
@@ -245,17 +250,9 @@ def _transforms(folder: Path) -> list[tuple[Path, Read]]:
     return [*found, (found[0][0], read_path)]
 
 
-def _colmap(folder: Path) -> list[tuple[Path, Read]]:
-    return _colmap_of(folder, ".bin")
-
-
-def _colmap_text(folder: Path) -> list[tuple[Path, Read]]:
-    return _colmap_of(folder, ".txt")
-
-
-def _colmap_of(folder: Path, suffix: str) -> list[tuple[Path, Read]]:
+def _colmap(folder: Path, suffix: str = ".bin") -> list[tuple[Path, Read]]:
     import pycolmap
-    from helpers import foreign_folders
+    from support.files import folders as foreign_folders
 
     from mi_nerfattack.capture.colmap import model as reader
 
@@ -333,9 +330,9 @@ def _routes(folder: Path) -> list[tuple[Path, Read]]:
 
 
 def _zed(folder: Path) -> list[tuple[Path, Read]]:
-    from helpers.zed_files import calibration_text
+    from support.files.recordings import calibration_text
 
-    from mi_nerfattack.robot.camera.zed import LeftEye, read_left_eye
+    from mi_nerfattack.car.camera.zed import LeftEye, read_left_eye
 
     path = folder / "SN1.conf"
     path.write_text(calibration_text())
@@ -362,25 +359,27 @@ FORMATS: dict[str, Format] = {
     "obj": Format(_obj, _TEXT),
     "ply": Format(_ply, _TEXT),
     "splats": Format(_splats, _TEXT),
+    "spz": Format(partial(_compact_splats, name="spz"), of_bytes),
+    "splat": Format(partial(_compact_splats, name="splat"), of_bytes),
     "png": Format(_png, _PNG),
     "jpeg": Format(_jpeg, of_bytes),
     "exr": Format(_exr, of_bytes),
     "transforms": Format(_transforms, _JSON_OR_BYTES),
     "colmap": Format(_colmap, of_bytes),
-    "colmap_text": Format(_colmap_text, _TEXT),
+    "colmap_text": Format(partial(_colmap, suffix=".txt"), _TEXT),
     "profile": Format(_profile, of_bytes),
     "patches": Format(_patches, _TEXT),
     "routes": Format(_routes, _JSON_OR_BYTES),
     "onnx": Format(programs.onnx_files, one_of(programs.of_onnx, of_bytes)),
     "policy": Format(programs.policies, programs.of_policy),
     "program": Format(programs.programs, one_of(programs.of_zip, of_bytes)),
-    "checkpoint": Format(
-        programs.checkpoints, one_of(programs.of_checkpoint, of_bytes)
-    ),
+    "checkpoint": Format(programs.checkpoints, programs.of_checkpoints),
     "record": Format(programs.records, _JSON_OR_BYTES),
     "poses": Format(programs.poses, _TEXT),
     "mcap": Format(programs.logs, one_of(of_text, of_bytes)),
     "video": Format(programs.videos, of_bytes),
     "xml": Format(programs.scenes, _TEXT),
     "zed": Format(_zed, _TEXT),
+    "request": Format(exchanges.requests, one_of(of_text, of_bytes)),
+    "answer": Format(exchanges.answers, one_of(of_text, of_bytes)),
 }

@@ -18,45 +18,23 @@ Mutation = Callable[[random.Random, bytes], bytes]
 
 #: Numbers at the edges of types, as text.
 NUMBERS = (
-    *(
-        "0",
-        "-0.0",
-        "1",
-        "-1",
-        "2",
-        "0.5",
-        "-0.5",
-        "70",
-        "255",
-        "256",
-        "65536",
-        "1e-320",
-    ),
-    *("2147483647", "2147483648", "4294967295", "4294967296", "9223372036854775807"),
-    *("9223372036854775808", "18446744073709551616", "1e38", "1e39", "-1e300", "1e308"),
-    *("1e400", "NaN", "nan", "inf", "-inf", "Infinity", "1" + "0" * 400, "7" * 5000),
+    *"0 -0.0 1 -1 2 0.5 -0.5 70 255 256 65536 1e-320 2147483647 2147483648".split(),
+    *"4294967295 4294967296 9223372036854775807 9223372036854775808".split(),
+    *"18446744073709551616 1e38 1e39 -1e300 1e308 1e400 NaN nan inf -inf".split(),
+    *("Infinity", "1" + "0" * 400, "7" * 5000),
 )
 #: Text where other text is expected.
 STRINGS = (
-    *("", " ", ".", "..", "/", "/dev/zero", "a" * 300, "a/" * 3000, "bundled:none"),
-    *(
-        "bundled:" + "a" * 300,
-        "bundled:../x",
-        "http://[::1",
-        "x.py:f",
-        "a.b:c",
-        "~",
-        "~x",
-    ),
-    *("\0", "\x1b[31m", "\ud800", "\u202e", "é", "💥", "1", "true", "\\", "%s", "{}"),
-    *("a.pt", "a.pt2", "a.onnx", "a.xml", "C:\\x", "nan", "1e400", "-", ":", "\n"),
+    *". .. / /dev/zero bundled:none bundled:../x http://[::1 x.py:f a.b:c ~ ~x".split(),
+    *("", " ", "\n", "\0", "\x1b[31m", "\ud800", "\u202e", "é", "💥", "C:\\x", "\\"),
+    *"1 true %s {} a.pt a.pt2 a.onnx a.xml nan 1e400 - :".split(),
+    *("a" * 300, "a/" * 3000, "bundled:" + "a" * 300),
 )
 #: Whole numbers at the edges of types.
-WHOLES = (0, 1, -1, 2, 3, 7, 16, 70, 127, 128, 255, 256, 1000, 65535, 65536, 1 << 24)
-WHOLES += tuple(
-    sign * (1 << bits) + off
-    for bits in (31, 32, 63)
-    for sign, off in ((1, 0), (1, -1), (-1, 0))
+WHOLES = (
+    *(0, 1, -1, 2, 3, 7, 16, 70, 127, 128, 255, 256, 1000, 65535, 65536, 1 << 24),
+    *((1 << bits) + off for bits in (31, 32, 63) for off in (0, -1)),
+    *(-1 << bits for bits in (31, 32, 63)),
 )
 _DTYPES = ("BOOL", "U8", "I8", "I16", "U16", "F16", "BF16", "I32", "F32", "F64", "I64")
 _TOKEN = re.compile(rb'"[^"\n]*"|[-+]?[0-9][0-9.eE+-]*|[A-Za-z_][A-Za-z0-9_]*|[^\s]')
@@ -100,7 +78,6 @@ def of_bytes(rng: random.Random, raw: bytes) -> bytes:
 
 
 def number_bytes(rng: random.Random) -> bytes:
-    """Write a whole or floating number at the edge of its type."""
     if rng.random() < 0.3:
         value = rng.choice((float("nan"), float("inf"), -1e38, 1e38, 1e-40, 0.0))
         return struct.pack(rng.choice("<>") + "f", value)
@@ -110,7 +87,6 @@ def number_bytes(rng: random.Random) -> bytes:
 
 
 def of_text(rng: random.Random, raw: bytes) -> bytes:
-    """Change a word, a number or a line of a text."""
     kind = rng.randrange(6)
     if kind < 4:
         found = list(_TOKEN.finditer(raw))
@@ -138,22 +114,19 @@ def _token(rng: random.Random, old: bytes, found: list[re.Match[bytes]]) -> byte
     if kind == 2:
         return rng.choice(NUMBERS).encode()
     if kind == 3 and old[:1] == b'"':
-        return json.dumps(rng.choice(STRINGS), ensure_ascii=False).encode(
-            "utf-8", "surrogatepass"
-        )
+        text = json.dumps(rng.choice(STRINGS), ensure_ascii=False)
+        return text.encode("utf-8", "surrogatepass")
     words = (b"true", b"null", b"[]", b"{}", b'""', b"1979-05-27", b"[[[1]]]", b"x")
     return rng.choice(words)
 
 
 def of_json(rng: random.Random, raw: bytes) -> bytes:
-    """Change a value, a key or a length of a JSON document."""
     tree = json.loads(raw)
     change(rng, tree)
     return json.dumps(tree).encode()
 
 
 def change(rng: random.Random, tree: Any) -> None:
-    """Change one place of a tree of dicts and lists."""
     places = [(tree, key) for key in _keys(tree)]
     for holder, key in places:
         places += [(holder[key], inner) for inner in _keys(holder[key])]
@@ -194,7 +167,6 @@ def _value(rng: random.Random) -> Any:
 
 
 def of_tensors(rng: random.Random, raw: bytes) -> bytes:
-    """Change names, types, shapes, values or metadata of a safetensors file."""
     length = int.from_bytes(raw[:8], "little")
     header, data = json.loads(raw[8 : 8 + length]), raw[8 + length :]
     names = [name for name in header if name != "__metadata__"]
@@ -205,9 +177,8 @@ def of_tensors(rng: random.Random, raw: bytes) -> bytes:
     elif kind == 1 and header.get("__metadata__"):
         about = header["__metadata__"]
         key = rng.choice(list(about))
-        about[key] = rng.choice(
-            (of_text(rng, about[key].encode()).decode("utf-8", "replace"), *STRINGS)
-        )
+        text = of_text(rng, about[key].encode()).decode("utf-8", "replace")
+        about[key] = rng.choice((text, *STRINGS))
     elif kind == 2:
         rng.shuffle(entry["shape"])
         entry["shape"] += [1] * rng.choice((0, 1, 70))
@@ -223,7 +194,6 @@ def of_tensors(rng: random.Random, raw: bytes) -> bytes:
 
 
 def _spoilt(rng: random.Random, data: bytes, entry: dict[str, Any]) -> bytes:
-    """Write a number over a value of a tensor."""
     start, end = entry["data_offsets"]
     at = rng.randrange(start, end) & ~7 if end > start else start
     value = number_bytes(rng)
@@ -245,28 +215,17 @@ def of_png(rng: random.Random, raw: bytes) -> bytes:
         size = int.from_bytes(raw[at : at + 4], "big")
         chunks.append((raw[at + 4 : at + 8], raw[at + 8 : at + 8 + size]))
         at += 12 + size
-    if not chunks:
-        return raw
-    i = rng.randrange(len(chunks))
-    name, data = chunks[i]
-    kind = rng.randrange(4)
-    if kind == 0:
-        chunks[i : i + 1] = []
-    elif kind == 1:
-        chunks.append(chunks.pop(i))
+    place, kind = rng.randrange(len(chunks)), rng.randrange(4)
+    name, data = chunks.pop(place)
+    if kind == 1:
+        chunks.append((name, data))
     elif kind == 2 and name == b"IDAT":
-        chunks[i] = name, zlib.compress(of_bytes(rng, _inflated(data)))
-    else:
-        chunks[i] = name, of_bytes(rng, data)
+        data = zlib.compress(of_bytes(rng, zlib.decompress(data)))
+        chunks.insert(place, (name, data))
+    elif kind > 1:
+        chunks.insert(place, (name, of_bytes(rng, data)))
     result = raw[:8]
     for name, data in chunks:
         crc = zlib.crc32(name + data).to_bytes(4, "big")
         result += len(data).to_bytes(4, "big") + name + data + crc
     return result
-
-
-def _inflated(data: bytes) -> bytes:
-    try:
-        return zlib.decompress(data)
-    except zlib.error:
-        return data

@@ -10,17 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fuzz.mutations import (
-    WHOLES,
-    of_bytes,
-    of_tensors,
-    of_text,
-    one_of,
-)
+from fuzz.mutations import WHOLES, of_bytes, of_tensors, of_text, one_of
 
 
 def onnx_files(folder: Path) -> list[tuple[Path, Any]]:
-    """Two networks, evaluated on an image and a goal."""
     import torch
 
     from mi_nerfattack.policy.onnx.network import load_onnx
@@ -70,18 +63,15 @@ def _onnx_shapes() -> Any:
         _node("Expand", "control wide", "other"),
         _node("LSTM", "seq wx wh", "y h", hidden_size=2),
     ]
-    constants = {
+    constants: dict[str, np.ndarray] = {
         "none": np.zeros(0, "f4"),
         "scales": np.float32([1, 1, 2, 2]),
-        "start": np.int64([0]),
-        "end": np.int64([2]),
-        "back": np.int64([0, -1]),
-        "pads": np.int64([0, 1, 0, 1]),
-        "wide": np.int64([2, 4]),
         "seq": np.ones((3, 1, 2), "f4"),
-        "wx": np.ones((1, 8, 2), "f4"),
-        "wh": np.ones((1, 8, 2), "f4"),
+        **dict.fromkeys(("wx", "wh"), np.ones((1, 8, 2), "f4")),
     }
+    sizes = {"start": [0], "end": [2], "back": [0, -1], "pads": [0, 1, 0, 1]}
+    sizes["wide"] = [2, 4]
+    constants |= {name: np.int64(size) for name, size in sizes.items()}
     return _model(nodes, constants)
 
 
@@ -92,44 +82,31 @@ def _node(name: str, inputs: str, outputs: str, **attributes: Any) -> Any:
 
 
 def _model(nodes: list[Any], constants: dict[str, np.ndarray]) -> Any:
-    from onnx import helper, numpy_helper
+    from support.files.policies import FLOAT, model
 
-    sizes = {"image": ["n", 3, 8, 10], "goal": ["n", 2], "control": ["n", 1]}
-    *inputs, output = [
-        helper.make_tensor_value_info(name, 1, shape) for name, shape in sizes.items()
-    ]
-    kept = [numpy_helper.from_array(v, n) for n, v in constants.items()]
-    graph = helper.make_graph(nodes, "test", inputs, [output], kept)
-    opset = helper.make_opsetid("", 17)
-    return helper.make_model(graph, opset_imports=[opset], ir_version=8)
+    inputs = {"image": (FLOAT, ["n", 3, 8, 10]), "goal": (FLOAT, ["n", 2])}
+    return model(nodes, inputs, {"control": (FLOAT, ["n", 1])}, constants)
 
 
 def of_onnx(rng: random.Random, raw: bytes) -> bytes:
-    """Change a field of an ONNX model, or of a part of it."""
     import onnx
 
     model = onnx.load_model_from_string(raw)
-    holders, at = [model.graph], 0
-    while at < len(holders):
-        for field, value in holders[at].ListFields():
+    holders: list[Any] = [model.graph]
+    for holder in holders:  # which grows
+        for field, value in holder.ListFields():
             if field.type == field.TYPE_MESSAGE:
                 holders += list(value) if field.label == 3 else [value]
-        at += 1
     holder = rng.choice(holders)
-    fields = [field for field, _ in holder.ListFields()]
-    if not fields:
-        return raw
-    field = rng.choice(fields)
-    value = getattr(holder, field.name)
-    if field.label == field.LABEL_REPEATED and len(value):
+    field, value = rng.choice(holder.ListFields())
+    if field.label == field.LABEL_REPEATED:
         i, j = rng.randrange(len(value)), rng.randrange(len(value))
-        if field.type == field.TYPE_MESSAGE:
-            if rng.random() < 0.5:
-                value.insert(i, value[j])
-            else:
-                del value[i]
-        else:
+        if field.type != field.TYPE_MESSAGE:
             value[i] = _scalar(rng, field, value[j], model)
+        elif rng.random() < 0.5:
+            value.insert(i, value[j])
+        else:
+            del value[i]
     elif field.type != field.TYPE_MESSAGE:
         setattr(holder, field.name, _scalar(rng, field, value, model))
     return model.SerializeToString()
@@ -139,11 +116,10 @@ def _scalar(rng: random.Random, field: Any, old: Any, model: Any) -> Any:
     if isinstance(old, bytes):
         return of_bytes(rng, old)
     if isinstance(old, str):
-        names = [node.op_type for node in model.graph.node]
-        for node in model.graph.node:
-            names += [*node.input, *node.output]
         from mi_nerfattack.policy.onnx.operators import OPERATORS
 
+        nodes = model.graph.node
+        names = [x for n in nodes for x in (n.op_type, *n.input, *n.output)]
         return rng.choice((*names, *OPERATORS, "", "x", "\x1b"))
     if isinstance(old, float):
         return float(rng.choice((0, -1, 1e38, -1e38, "nan", "inf", 0.5)))
@@ -199,13 +175,12 @@ def _unless_good(load: Any) -> Any:
 
 
 def of_policy(rng: random.Random, raw: bytes) -> bytes:
-    """Damage a file of tensors, or a ZIP archive."""
     return (_ZIP if raw[:2] == b"PK" else _TENSORS)(rng, raw)
 
 
 def programs(folder: Path) -> list[tuple[Path, Any]]:
     """Archives of programs; they are opened, and not run."""
-    from mi_nerfattack.policy.exported.load import _read_archive
+    from mi_nerfattack.policy.exported import _read_archive
 
     with zipfile.ZipFile(folder / "a.pt2", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("a/version", "3\n")
@@ -236,7 +211,6 @@ def of_zip(rng: random.Random, raw: bytes) -> bytes:
 
 
 def records(folder: Path) -> list[tuple[Path, Any]]:
-    """What a training writes beside its policy."""
     from mi_nerfattack.scenes import bundled
     from mi_nerfattack.training.record import read_record
 
@@ -246,72 +220,55 @@ def records(folder: Path) -> list[tuple[Path, Any]]:
 
 
 def poses(folder: Path) -> list[tuple[Path, Any]]:
-    """Poses of recorded drives, as CSV and TOML."""
-    from helpers import recorded_drives as drives
-
-    from mi_nerfattack.deploy.replay.environment import open_recording
+    from support.files import recordings as drives
 
     drives.write_csv_folder(folder / "csv")
     drives.write_csv_folder(folder / "toml")
     (folder / "toml/poses.csv").unlink()
-    rows = [line.split(",") for line in drives.csv_rows()]
     text = "[camera]\nwidth = 16\nheight = 8\nfx = 8.0\nfy = 8.0\ncx = 8.0\ncy = 4.0\n"
-    for time, name, x, y, angle in rows:
+    for time, name, x, y, angle in (line.split(",") for line in drives.csv_rows()):
         text += f'[[frames]]\ntime_s = {time}\nfile = "{name}"\n'
         text += f"x_m = {x}\ny_m = {y}\nheading_rad = {angle}\n"
     (folder / "toml/poses.toml").write_text(text)
-
-    def read(path: Path) -> None:
-        recording = open_recording(path.parent, drives.CAMERA, drives.MOUNT)
-        recording.image(0)
-        recording.depth(0)
-
-    return [(folder / f"{kind}/poses.{kind}", read) for kind in ("csv", "toml")]
+    return [(folder / f"{kind}/poses.{kind}", _replay) for kind in ("csv", "toml")]
 
 
 def logs(folder: Path) -> list[tuple[Path, Any]]:
-    """MCAP logs, compressed and not, and a video."""
-    from helpers import recorded_drives as drives
-
-    from mi_nerfattack.deploy.replay.environment import open_recording
+    from support.files import recordings as drives
 
     topics = drives.log_messages(folder)
-    paths = [
-        drives.write_log(folder / f"{kind}.mcap", topics, kind)
+    return [
+        (drives.write_log(folder / f"{kind}.mcap", topics, kind), _replay)
         for kind in ("NONE", "ZSTD", "LZ4")
     ]
 
-    def read(path: Path) -> None:
-        recording = open_recording(path, None, drives.MOUNT)
-        recording.image(0)
-
-    return [(path, read) for path in paths]
-
 
 def videos(folder: Path) -> list[tuple[Path, Any]]:
-    """Videos beside their poses."""
-    from helpers import recorded_drives as drives
+    from support.files import recordings as drives
+
+    return [(drives.write_drive_video(folder), _replay)]
+
+
+def _replay(path: Path) -> None:
+    """Open a recording, and read its images, and depths where there are some."""
+    from support.files.recordings import CAMERA, MOUNT
 
     from mi_nerfattack.deploy.replay.environment import open_recording
 
-    path = drives.write_drive_video(folder)
-
-    def read(path: Path) -> None:
-        recording = open_recording(path, None, drives.MOUNT)
-        for index in range(len(recording.track.times)):
-            recording.image(index)
-
-    return [(path, read)]
+    is_folder = path.stem == "poses"
+    recording = open_recording(
+        path.parent if is_folder else path, CAMERA if is_folder else None, MOUNT
+    )
+    for index in range(len(recording.track.times) if path.suffix == ".mp4" else 1):
+        recording.image(index)
+    if is_folder:
+        recording.depth(0)
 
 
 def scenes(folder: Path) -> list[tuple[Path, Any]]:
-    """A Mitsuba scene with a mesh, a picture and a field."""
-    from mi_nerfattack import variant
-
-    variant.ensure()
-    from helpers.mesh_samples import four_colours
-    from helpers.small_fields import blob
-    from helpers.tiny_place import SCENE
+    from support.files.objects import four_colours
+    from support.worlds.fields import blob
+    from support.worlds.places import SCENE
 
     from mi_nerfattack.fields.io import save_field
     from mi_nerfattack.render.pathtrace.load import load_scene, scene_files
@@ -341,17 +298,13 @@ def scenes(folder: Path) -> list[tuple[Path, Any]]:
 
 
 def checkpoints(folder: Path) -> list[tuple[Path, Any]]:
-    """The state of an attack and a finished drive."""
-    from mi_nerfattack import variant
-
-    variant.ensure()
-    from helpers import toy_loop as toy
+    from support.worlds import loops as toy
 
     from mi_nerfattack.attack.gradient import GradientAttack
     from mi_nerfattack.attack.objectives import CrossTrackDeviation
-    from mi_nerfattack.experiment.checkpoint import CheckpointFile
-    from mi_nerfattack.experiment.effort import Effort
-    from mi_nerfattack.experiment.kept_drives import KeptDrives
+    from mi_nerfattack.drives.spec import FORMAT, DriveSpec
+    from mi_nerfattack.drives.store import Store, read_drive
+    from mi_nerfattack.experiment.run_folder import CheckpointFile
     from mi_nerfattack.rollout.drive import Drive
     from mi_nerfattack.rollout.function import Rollout
     from mi_nerfattack.rollout.objective import StageSum
@@ -361,20 +314,18 @@ def checkpoints(folder: Path) -> list[tuple[Path, Any]]:
     rollout = Rollout(loop, objective, 2)
     attack = GradientAttack(rollout, toy.ROUTE, loop.initial(np.zeros((1, 3))))
     path = folder / "checkpoint.safetensors"
-    CheckpointFile(path, {"a": "1"}).save(attack, Effort())
-    drives = KeptDrives(folder / "drives", {"a": "1"}, "line", 0)
+    CheckpointFile(path, {"a": "1"}).save(attack)
+    spec = DriveSpec("surrogate", "line", "attack", 0, 0, 2, {"format": FORMAT})
+    store = Store(folder / "drives")
     rows = np.zeros((3, 3)), np.zeros(2), np.zeros(2), np.arange(2.0)
-    drives.add(Drive("surrogate", "line", "attack", 0, 0, *rows), Effort())
+    store.add(spec, Drive("surrogate", "line", "attack", 0, 0, *rows), 1.0)
 
     def read(path: Path) -> None:
         kept = CheckpointFile(path, {"a": "1"})
         kept.read()
         kept.restore(attack)
 
-    def read_drive(path: Path) -> None:
-        KeptDrives(path.parent, {"a": "1"}, "line", 0).read()
-
-    return [(path, read), (drives.paths()[0], read_drive)]
+    return [(path, read), (store.path(spec), read_drive)]
 
 
 def of_checkpoint(rng: random.Random, raw: bytes) -> bytes:
@@ -392,5 +343,6 @@ def of_checkpoint(rng: random.Random, raw: bytes) -> bytes:
     return len(text).to_bytes(8, "little") + text + raw[8 + length :]
 
 
+of_checkpoints = one_of(of_checkpoint, of_bytes)
 _TENSORS = one_of(of_tensors, of_tensors, of_bytes)
 _ZIP = one_of(of_zip, of_zip, of_bytes)

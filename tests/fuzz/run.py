@@ -29,6 +29,7 @@ import mi_nerfattack  # noqa: F401  before drjit: it chooses the LLVM
 # isort: split
 from fuzz.formats import FORMATS, Read
 
+from mi_nerfattack import variant
 from mi_nerfattack.errors import NerfAttackError
 
 SECONDS = 10.0
@@ -39,14 +40,7 @@ LONGEST = 10_000  # characters of a message
 
 @dataclass(frozen=True)
 class Plan:
-    """What to read.
-
-    Args:
-        jobs: formats and numbers of inputs, in order.
-        seed: of all.
-        verbose: show tracebacks and what libraries print.
-        keep: folder for the inputs that fail.
-    """
+    """Formats and numbers of inputs, in order; a folder keeps those that fail."""
 
     jobs: Sequence[tuple[str, int]]
     seed: int
@@ -55,7 +49,6 @@ class Plan:
 
 
 def main() -> int:
-    """Fuzz some formats, or all, and print a line for each kind of failure."""
     parser = argparse.ArgumentParser(prog="fuzz", description=__doc__.split("\n")[0])
     parser.add_argument("formats", nargs="*", default=list(FORMATS))
     parser.add_argument("--count", type=int, default=100)
@@ -73,7 +66,6 @@ def main() -> int:
 
 
 def fuzz(plan: Plan) -> dict[tuple[str, str], list[int]]:
-    """Return which inputs of which format fail, by what happens."""
     failures: dict[tuple[str, str], list[int]] = {}
     at = 0
     with tempfile.TemporaryDirectory() as folder:
@@ -123,7 +115,6 @@ def _cpu_seconds(process: int) -> float:
 
 
 def _child(plan: Plan, at: int, shared: mmap.mmap, report: Path, work: str) -> None:
-    """Read damaged files from a job on, and end the process."""
     code = 1
     try:
         if not plan.verbose:  # what libraries print is no outcome
@@ -164,6 +155,7 @@ def _prepare(name: str, folder: Path) -> list[tuple[Path, Read]]:
     folder.mkdir()
     _, most = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    variant.ensure()
     targets = FORMATS[name].prepare(folder)
     for path, read in targets:
         read(path)
@@ -173,7 +165,6 @@ def _prepare(name: str, folder: Path) -> list[tuple[Path, Read]]:
 
 
 def _outcome(read: Read, path: Path, verbose: bool) -> str:
-    """Read a file; say what happened where it is neither valid nor our error."""
     try:
         read(path)
     except NerfAttackError as err:

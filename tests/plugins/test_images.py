@@ -1,13 +1,21 @@
-"""Images of fields through Mitsuba: integrator, emitter, surfaces, derivatives."""
+"""The integrator with every film, filter, crop and sensor; the emitter as a light.
+
+From inside its shape, `field_emitter` under the stock `path` marches the same rays
+from the same origins: the stock integrator says what the film should show.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import small_fields as small
+from support.reference.derivatives import Derivatives, key_of, later
+from support.worlds import fields as small
+from support.worlds.fields import T, load
 
 from mi_nerfattack.fields import load_field, save_field
 from mi_nerfattack.render.march import march
@@ -16,162 +24,235 @@ from mi_nerfattack.render.rays import Rays
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-WIDTH, HEIGHT = 16, 12
-OUTSIDE, INSIDE = "3,1,.5", "-.4,.2,.1"
-BLACK = '<bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>'
-LIGHT = '<emitter type="area"><rgb name="radiance" value="0,2,0"/></emitter>'
-VIEWS = pytest.mark.parametrize("eye", [OUTSIDE, INSIDE], ids=["outside", "inside"])
-
-
-def volume(path: Path, kind: str = "grid_field", name: str = "object") -> str:
-    """Write a volume as XML."""
-    filename = f'<string name="filename" value="{path}"/>'
-    return f'<volume type="{kind}" id="{name}">{filename}</volume>'
-
-
-def scene(integrator: str, world: str = "", eye: str = OUTSIDE) -> mi.Scene:
-    """Load a scene of 16 x 12 pixels that looks at the origin."""
-    return mi.load_string(
-        '<scene version="3.0.0"><sensor type="perspective">'
-        '<float name="fov" value="60"/><transform name="to_world">'
-        f'<lookat origin="{eye}" target="0,0,0" up="0,0,1"/></transform>'
-        f'<film type="hdrfilm"><integer name="width" value="{WIDTH}"/>'
-        f'<integer name="height" value="{HEIGHT}"/><rfilter type="box"/>'
-        '<string name="pixel_format" value="rgb"/></film></sensor>'
-        f"{integrator}{world}</scene>",
-        parallel=False,
-    )
-
-
-def fields(inside: str) -> str:
-    """Write a field_integrator with AOVs as XML; stop 0 makes it exact."""
-    more = '<float name="stop" value="0"/><boolean name="aovs" value="true"/>'
-    return f'<integrator type="field_integrator">{more}{inside}</integrator>'
-
-
-def emitter(inside: str) -> str:
-    """Write a cube with a field_emitter, a little larger than the fields' box."""
-    return (
-        '<shape type="cube"><transform name="to_world"><scale value="1.01"/>'
-        f'</transform>{BLACK}<emitter type="field_emitter"><float name="stop" '
-        f'value="0"/>{inside}</emitter></shape>'
-    )
-
-
-def rectangle(x: float, half: float = 9.0) -> str:
-    """Write a green light in the plane of one x that faces +x."""
-    return (
-        f'<shape type="rectangle"><transform name="to_world"><scale value="{half}"/>'
-        f'<rotate y="1" angle="90"/><translate x="{x}"/></transform>{LIGHT}{BLACK}'
-        "</shape>"
-    )
-
-
-def render(loaded: mi.Scene, spp: int = 1, seed: int = 0) -> np.ndarray:
-    """Render (height, width, channels)."""
-    return np.array(mi.render(loaded, spp=spp, seed=seed))
+CROP = {"crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 7, "crop_height": 5}
+VIEW = {"eye": (-0.4, 0.2, 0.1), "target": (0.3, 0, 0), "fov": 70}
+SIZE = {"width": 14, "height": 9}
+BLACK = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
 
 
 @pytest.fixture
-def grid(tmp_path: Path, variant: str, rng: np.random.Generator) -> Path:
-    path = tmp_path / "grid.safetensors"
-    save_field(path, small.blob(rng, step_m=0.03))
-    return path
+def grid(tmp_path: Path, variant: str, rng: np.random.Generator) -> dict[str, Any]:
+    """A blob in [-1, 1]^3 as a volume."""
+    save_field(tmp_path / "grid.safetensors", small.blob(rng, step_m=0.05))
+    return {"type": "grid_field", "filename": str(tmp_path / "grid.safetensors")}
 
 
-@pytest.fixture
-def ngp(tmp_path: Path, variant: str) -> Path:
-    path = tmp_path / "ngp.safetensors"
-    field = small.small_ngp()
-    field.step_m = 0.02
-    save_field(path, field)
-    return path
+def scene(grid: dict, more: dict | None = None, **film: Any) -> mi.Scene:
+    """Load a scene with a field_integrator."""
+    nested = {"object": grid, **(more or {})}
+    return load(nested, **{**VIEW, **SIZE, **film})
 
 
-# Values
+def stock(grid: dict, **film: Any) -> mi.Scene:
+    """Load the same scene for the stock path tracer."""
+    lamp = {"type": "field_emitter", "stop": 0.0, "object": grid}
+    cube = {"type": "cube", "to_world": T().scale(1.01), "bsdf": BLACK}
+    path = {"type": "path", "max_depth": 1}
+    return load(path, {"cube": {**cube, "lamp": lamp}}, **VIEW, **SIZE, **film)
 
 
-@VIEWS
-def test_integrator_shows_the_march(grid: Path, eye: str) -> None:
-    loaded = scene(fields(volume(grid)), eye=eye)
-    image = render(loaded)
+def shown(loaded: mi.Scene, spp: int = 2, **options: Any) -> np.ndarray:
+    return np.array(mi.render(loaded, spp=spp, **options))
+
+
+def check_derivatives(loaded, rng, channels: int, **view: Any) -> None:
+    """Compare the derivatives of the first channels of an image by the colours."""
+    params = mi.traverse(loaded)
+    key = key_of(params, "colour")
+
+    def output() -> mi.TensorXf:
+        seeds = {"seed": 9, "seed_grad": 3}
+        if not dr.grad_enabled(params[key]):
+            seeds = {"seed": 3}
+        return mi.render(loaded, params, spp=2, **seeds, **view)[..., :channels]
+
+    found = Derivatives(params, key, output)
+    found.check([rng.normal(0, 1, found.base.shape)])
+
+
+@pytest.mark.parametrize("eye", [(3, 1, 0.5), (-0.4, 0.2, 0.1)], ids=["out", "in"])
+def test_integrator_shows_the_march(grid, eye) -> None:
+    loaded = scene(grid, {"aovs": True}, eye=eye)
+    image = shown(loaded, 1, seed=0)
     ray = small.first_rays(loaded)
-    posed = PosedField(load_field(grid))
-    seen = march(posed, Rays(ray.o, ray.d), 0.0)
-    expected = [*seen.radiance, seen.opacity, seen.depth]
-    expected += [*seen.radiance, seen.opacity, seen.depth]
-    assert image.shape == (HEIGHT, WIDTH, 10)
+    seen = march(PosedField(load_field(grid["filename"])), Rays(ray.o, ray.d), 0.0)
+    expected = 2 * [*seen.radiance, seen.opacity, seen.depth]
+    assert image.shape == (9, 14, 10)
     for channel, values in enumerate(expected):
         found = image[..., channel].ravel()
         np.testing.assert_allclose(found, values.numpy(), rtol=1e-3, atol=1e-5)
 
 
-@VIEWS
-@pytest.mark.parametrize("integrator", ["path", "direct"])
-def test_emitter_shows_what_the_integrator_shows(grid, ngp, eye, integrator) -> None:
-    inside = volume(grid) + volume(ngp, "ngp_field", "scene")
-    one = scene(fields(inside), eye=eye)
-    other = scene(f'<integrator type="{integrator}"/>', emitter(inside), eye)
-    a, b = render(one)[..., :3], render(other)[..., :3]
-    # Rays that pass by the cube see the sky of the integrator alone.
-    met = b.sum(-1) > 0
-    assert a[met].max() > 0.05
-    # From outside, the steps count from the surface instead of the camera.
-    error = 1e-4 if eye == INSIDE else 3e-3
-    np.testing.assert_allclose(a[met], b[met], rtol=1e-3, atol=error)
-
-
-def test_emitter_lights_other_surfaces(tmp_path: Path) -> None:
-    # An opaque homogeneous box is a lamp of one radiance, as an area light is.
-    path = tmp_path / "lamp.safetensors"
-    save_field(path, small.homogeneous(1e4))
-    radiance = float(small.sigmoid_to_linear(np.array(0.3)))
-    floor = (
-        '<shape type="rectangle"><transform name="to_world"><scale value="6"/>'
-        '<translate z="-2"/></transform><bsdf type="diffuse"/></shape>'
+@pytest.mark.parametrize(
+    ("rfilter", "window"),
+    [("box", CROP), ("gaussian", CROP), ("lanczos", {})],
+    ids=["box crop", "gaussian crop", "lanczos"],
+)
+def test_filters_and_crops_are_those_of_the_path_tracer(
+    grid, rng, rfilter, window
+) -> None:
+    film = {"rfilter": {"type": rfilter}, "sample_border": rfilter == "gaussian"}
+    loaded = scene(grid, **film, **window)
+    found, expected = (
+        shown(x, 3, seed=5) for x in (loaded, stock(grid, **film, **window))
     )
-    stock = (
-        f'<shape type="cube">{BLACK}<emitter type="area"><rgb name="radiance" '
-        f'value="{radiance}"/></emitter></shape>'
-    )
-    eye = "5,1,2"
-    own = emitter(volume(path)).replace('<scale value="1.01"/>', "")
-    images = [
-        render(scene('<integrator type="direct"/>', floor + lamp, eye), spp=64)
-        for lamp in (own, stock)
-    ]
-    lit = (images[1] > 0).any(-1) & (images[1] < 0.9 * radiance).all(-1)
-    assert lit.mean() > 0.3
-    expected = images[1][lit].mean()
-    np.testing.assert_allclose(images[0][lit].mean(), expected, rtol=0.03)
+    assert expected.shape[:2] == ((5, 7) if window else (9, 14))
+    assert expected.std() > 0.01
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+    check_derivatives(loaded, rng, 3)
 
 
-def test_surface_in_front_hides_the_field(grid: Path) -> None:
-    image = render(scene(fields(volume(grid)), rectangle(2.0)))
-    assert (image[..., 3] == 0).all() and (image[..., 4] == np.inf).all()
-    assert (image[..., :3] == 0).all()  # without a nested integrator
+@pytest.mark.parametrize(
+    ("pixel_format", "channels"), [("luminance_alpha", 2), ("rgba", 4), ("xyz", 3)]
+)
+def test_pixel_formats(grid, pixel_format: str, channels: int, rng) -> None:
+    loaded = scene(grid, pixel_format=pixel_format)
+    image, expected = shown(loaded), shown(stock(grid, pixel_format=pixel_format))
+    assert image.shape[2] == channels
+    if pixel_format.endswith("a"):
+        # The path tracer's is 1 on the whole cube, ours the opacity.
+        marched = scene(grid, {"aovs": True}, pixel_format=pixel_format)
+        expected[..., -1] = shown(marched)[..., channels]
+    np.testing.assert_allclose(image, expected, atol=1e-4)
+    check_derivatives(loaded, rng, channels)
 
 
-def test_sky_does_not_lie_behind_surfaces(ngp: Path) -> None:
-    inside = fields(volume(ngp, "ngp_field", "scene"))
-    walled = render(scene(inside, rectangle(-2.0, 99.0)))
-    np.testing.assert_allclose(walled[..., :3], walled[..., 5:8], atol=1e-5)
-    assert walled[..., 3].max() > 0.1
+def test_every_sensor_of_a_scene(grid, rng) -> None:
+    films = {}, {"eye": (2.5, 0.5, 1)}, {"rfilter": {"type": "gaussian"}, **CROP}
+    alone = [scene(grid, {"aovs": True}, **film) for film in films]
+    sensors = {f"sensor_{i}": x.sensors()[0] for i, x in enumerate(alone)}
+    integrator = {"type": "field_integrator", "stop": 0.0, "aovs": True, "object": grid}
+    together = {"type": "scene", "i": integrator, **sensors}
+    loaded = mi.load_dict(together, parallel=False)
+    for index, one in enumerate(alone):
+        expected = shown(one, seed=1)[..., :4]
+        for sensor in (index, loaded.sensors()[index]):
+            image = shown(loaded, sensor=sensor, seed=1)[..., :4]
+            # filters splat in the order of the threads
+            np.testing.assert_allclose(image, expected, atol=1e-6)
+    check_derivatives(loaded, rng, 3, sensor=2)
 
 
-def test_jitter_keeps_the_mean(grid: Path) -> None:
-    fixed = render(scene(fields(volume(grid))), spp=64)
-    jitter = '<boolean name="jitter" value="true"/>'
-    noisy = render(scene(fields(jitter + volume(grid))), spp=64)
+def test_jitter_keeps_the_mean(grid) -> None:
+    fixed, noisy = (shown(scene(grid, {"jitter": x}), 64) for x in (False, True))
     assert not np.array_equal(fixed, noisy)
-    a, b = fixed[..., :4].mean((0, 1)), noisy[..., :4].mean((0, 1))
-    np.testing.assert_allclose(b, a, rtol=0.02)
+    np.testing.assert_allclose(noisy.mean((0, 1)), fixed.mean((0, 1)), rtol=0.02)
 
 
-@pytest.mark.usefixtures("no_variant_left")
-def test_monochromatic_variant_shows_luminance(grid: Path) -> None:
-    colour = render(scene(fields(volume(grid))))
-    mi.set_variant("llvm_ad_mono")
-    mono = render(scene(fields(volume(grid))))
-    expected = colour[..., :3] @ [0.212671, 0.715160, 0.072169]
-    np.testing.assert_allclose(mono[..., 0], expected, rtol=1e-3, atol=1e-4)
+def test_a_thin_lens_and_a_motion_blurred_sensor_render(grid) -> None:
+    sharp = shown(scene(grid, {"aovs": True}, eye=(3, 1, 0.5)), 64)[..., :4]
+    lens = {
+        "type": "thinlens",
+        "fov": 70,
+        "to_world": T().look_at([3, 1, 0.5], [0.3, 0, 0], [0, 0, 1]),
+        "film": {"type": "hdrfilm", "pixel_format": "rgb", **SIZE},
+        **{"aperture_radius": 0.4, "focus_distance": 1.0, "shutter_close": 1.0},
+    }
+    loaded = load({"object": grid, "aovs": True}, {"camera": lens})
+    blurred = shown(loaded, 64)[..., :4]
+    assert np.isfinite(blurred).all()
+    # Out of focus, the blob's light spreads.
+    assert blurred[..., 3].max() < sharp[..., 3].max()
+    assert (blurred[..., 3] > 0).sum() >= (sharp[..., 3] > 0).sum()
+
+
+# The emitter as a light: emitter sampling against BSDF sampling, both sides
+
+WIDTH, HEIGHT = 8, 6
+BY_BSDF = {"type": "direct", "emitter_samples": 0, "bsdf_samples": 1}
+BY_EMITTER = {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0}
+BOTH = {"type": "path", "max_depth": 2}
+SHAPES = {"cube": 1.0, "sphere": 3**0.5}  # size around the box [-1, 1]^3
+
+
+@pytest.fixture(params=["llvm_ad_rgb", *later("llvm_ad_spectral")])
+def bright(request, tmp_path: Path, rng: np.random.Generator, no_variant_left) -> Path:
+    """A file with a bright blob in [-1, 1]^3."""
+    mi.set_variant(request.param)
+    save_field(tmp_path / "bright.safetensors", small.blob(rng, peak=4, step_m=0.2))
+    return tmp_path / "bright.safetensors"
+
+
+def lit_scene(path: Path, shape: str, integrator: dict, inside: bool) -> mi.Scene:
+    """Load a diffuse surface lit by the emitter, outside or inside of its shape."""
+    field = {"type": "grid_field", "filename": str(path)}
+    lamp = {"type": shape, "to_world": T().scale(1.01 * SHAPES[shape]), "bsdf": BLACK}
+    lamp["emitter"] = {"type": "field_emitter", "object": field}
+    lit = {"type": "rectangle", "to_world": T().translate([0, 0, -2]).scale(2)}
+    view = {"eye": (6, 2, 0), "target": (0, 0, -2), "fov": 20}
+    if inside:
+        lit = {"type": "sphere", "to_world": T().translate([0.7, 0, 0]).scale(0.25)}
+        view = {"eye": (0.1, 0.3, 0.9), "target": (0.7, 0, 0), "fov": 25}
+    world = {"lamp": lamp, "lit": {**lit, "bsdf": {"type": "diffuse"}}}
+    seeing = {"hide_emitters": True, **integrator}
+    return load(seeing, world, **view, width=WIDTH, height=HEIGHT)
+
+
+def estimate(loaded: mi.Scene, spp: int, runs: int = 16) -> tuple[np.ndarray, Any]:
+    """Return the mean image over seeds and its standard error."""
+    images = [np.array(mi.render(loaded, spp=spp, seed=k)) for k in range(runs)]
+    return np.mean(images, 0), np.std(images, 0, ddof=1) / np.sqrt(runs)
+
+
+@pytest.mark.parametrize(
+    ("integrator", "shape", "inside"),
+    [
+        (BOTH, "cube", False),
+        (BY_EMITTER, "sphere", False),
+        (BOTH, "sphere", True),
+        (BY_EMITTER, "cube", True),
+    ],
+    ids=["path cube", "emitter sphere", "path in sphere", "emitter in cube"],
+)
+def test_emitter_sampling_agrees_with_bsdf_sampling(
+    bright: Path, shape: str, integrator: dict, inside: bool
+) -> None:
+    expected, noise = estimate(lit_scene(bright, shape, BY_BSDF, inside), 512)
+    found, other = estimate(lit_scene(bright, shape, integrator, inside), 512)
+    assert expected.mean() > 1e-3
+    error = (found - expected) / np.sqrt(noise**2 + other**2 + 1e-12)
+    # Student's t with about 30 degrees of freedom, over 144 values.
+    assert np.abs(error).max() < 6
+    # Channels share their noise, pixels do not.
+    bound = 5 * np.sqrt((noise**2 + other**2).mean() / (WIDTH * HEIGHT))
+    assert abs(found.mean() - expected.mean()) < bound < 0.15 * expected.mean()
+
+
+@pytest.mark.parametrize(
+    ("shape", "eye"), [("cube", (3.0, 0.4, 0.2)), ("sphere", (0.3, 0.2, 0.1))]
+)
+def test_sampled_directions_carry_their_density(bright: Path, shape: str, eye) -> None:
+    # sum(radiance / density) over samples is the irradiance of a whole sphere.
+    loaded = lit_scene(bright, shape, BOTH, False)
+    (emitter,) = loaded.emitters()
+    rng = np.random.default_rng(0)
+    it = dr.zeros(mi.Interaction3f, 1 << 19)
+    it.p = mi.Point3f(*eye)
+    if mi.is_spectral:
+        it.wavelengths = mi.Spectrum(450.0, 500.0, 550.0, 600.0)
+    sample = mi.Point2f(rng.random((2, 1 << 19)).astype(np.float32))
+    ds, weight = emitter.sample_direction(it, sample)
+    density = emitter.pdf_direction(it, ds)
+    np.testing.assert_allclose(density, ds.pdf, rtol=1e-3)
+    value = emitter.eval_direction(it, ds)
+    product = np.array(weight) * np.array(ds.pdf)
+    np.testing.assert_allclose(product, np.array(value), rtol=1e-3, atol=1e-6)
+
+    # Directions all around see the same light, where the shape is met.
+    around = mi.warp.square_to_uniform_sphere(sample)
+    ray = mi.Ray3f(it.p, around)
+    ray.wavelengths = it.wavelengths
+    si = loaded.ray_intersect(ray)
+    seen = np.array(si.emitter(loaded).eval(si)) * 4 * np.pi
+    # From outside, a line meets a convex shape twice, and both points are sampled.
+    front = np.array(dr.dot(ds.n, ds.d)) < 0 if max(eye) > 1 else 1
+    found = np.array(weight) * front
+    noise = np.sqrt((seen.var(1) + found.var(1)) / seen.shape[1])
+    assert (noise < 0.05 * seen.mean(1)).all()
+    assert (np.abs(found.mean(1) - seen.mean(1)) < 4 * noise).all()
+
+
+def test_light_tracing_from_the_emitter_is_refused(bright: Path) -> None:
+    (emitter,) = lit_scene(bright, "cube", BOTH, False).emitters()
+    with pytest.raises(NotImplementedError, match="field_emitter: "):
+        emitter.sample_ray(0.0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))

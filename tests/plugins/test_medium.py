@@ -15,11 +15,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import small_fields as small
-from helpers.variants import RGB, SPECTRAL, later
+from support.reference.derivatives import RGB, SPECTRAL, later
+from support.worlds import fields as small
 
 from mi_nerfattack.fields import GridField, GridLayout, load_field, save_field
-from mi_nerfattack.scenes import bundled
 
 TEXELS = 80
 CENTRES = np.linspace(-1, 1, TEXELS)
@@ -67,42 +66,15 @@ def scene(sigma_t: Any, albedo: Any, integrator: str) -> mi.Scene:
     """Load a cube of a medium in a constant light."""
     light = {"type": "rgb", "value": [1.0, 0.7, 0.4]}
     medium = {"type": "heterogeneous", "sigma_t": sigma_t, "albedo": albedo}
-    view = mi.ScalarTransform4f().look_at([3, 2, 1], [0, 0, 0], [0, 0, 1])
-    film = {"type": "hdrfilm", "width": 12, "height": 8, "rfilter": {"type": "box"}}
-    if mi.is_monochromatic:
-        film["pixel_format"] = "luminance"
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": integrator, "max_depth": 5},
-            "light": {"type": "constant", "radiance": light},
-            "sensor": {"type": "perspective", "fov": 40, "to_world": view, "f": film},
-            "cube": {"type": "cube", "bsdf": {"type": "null"}, "interior": medium},
-        },
-        parallel=False,
-    )
+    world = {
+        "light": {"type": "constant", "radiance": light},
+        "cube": {"type": "cube", "bsdf": {"type": "null"}, "interior": medium},
+    }
+    seeing = {"type": integrator, "max_depth": 5}
+    return small.load(seeing, world, eye=(3, 2, 1), fov=40)
 
 
-@pytest.mark.parametrize("each_variant", [*RGB, *later(*SPECTRAL)], indirect=True)
-def test_values_bound_and_box_are_those_of_gridvolume(path: Path, rng) -> None:
-    field, grid = mi.load_dict(own(path)), mi.load_dict(sampled(path)[0])
-    it = dr.zeros(mi.Interaction3f, 10_000)
-    it.p = mi.Point3f(rng.uniform(-1, 1, (3, 10_000)).astype(np.float32))
-    expected = grid.eval_1(it).numpy()
-    np.testing.assert_allclose(field.eval_1(it).numpy(), expected, rtol=2e-6)
-    for channel in np.array(field.eval(it)):
-        np.testing.assert_allclose(channel, expected, rtol=1e-5)
-    assert field.max() == pytest.approx(grid.max(), rel=1e-6)
-    margin = 1.0 / (TEXELS - 1)
-    np.testing.assert_allclose(field.bbox().max + margin, grid.bbox().max, rtol=1e-6)
-    np.testing.assert_allclose(field.bbox().min - margin, grid.bbox().min, rtol=1e-6)
-    assert list(field.resolution()) == [2, 2, 2]
-
-
-@pytest.mark.parametrize(
-    "integrator",
-    ["volpath", *later("volpathmis", "prbvolpath")],
-)
+@pytest.mark.parametrize("integrator", ["volpath", *later("volpathmis", "prbvolpath")])
 def test_fields_render_as_gridvolumes(path: Path, integrator: str) -> None:
     density, radiance = sampled(path)
     pairs = [(own(path), own(path, "radiance")), (density, radiance)]
@@ -137,8 +109,6 @@ def test_a_limit_cuts_density_and_majorant(path: Path, rng) -> None:
     assert 0.1 < (expected == 1).mean() < 0.9
     np.testing.assert_array_equal(cut.eval_1(it).numpy(), expected)
     assert cut.max() == 1 < whole.max()
-    with pytest.raises(RuntimeError, match="density_limit: 0.0; must be positive"):
-        mi.load_dict({**own(path), "density_limit": 0.0})
 
 
 def gradients(loaded: mi.Scene, suffixes: tuple[str, ...]) -> list[np.ndarray]:
@@ -183,34 +153,3 @@ def test_gradients_are_those_of_gridvolume_by_the_chain_rule(path: Path) -> None
         expected /= colour * (1 - colour)
         scale = np.abs(expected).max()
         np.testing.assert_allclose(found[1], expected, atol=1e-3 * scale)
-
-
-def shown(integrator: dict[str, Any], shape: dict[str, Any]) -> np.ndarray:
-    """Show what is in the bundled hydrant's box before a white light."""
-    view = mi.ScalarTransform4f().look_at([-2, 0.3, 0.6], [0, 0, 0.375], [0, 0, 1])
-    film = {"type": "hdrfilm", "width": 32, "height": 48, "rfilter": {"type": "box"}}
-    camera = {"type": "perspective", "fov": 20, "to_world": view, "film": film}
-    parts = {"integrator": integrator, "sensor": camera, "light": {"type": "constant"}}
-    whole = mi.load_dict({"type": "scene", **parts, **shape}, parallel=False)
-    return np.array(mi.render(whole, spp=64, seed=1))
-
-
-@pytest.mark.usefixtures("variant")
-def test_a_medium_is_empty_where_its_field_is() -> None:
-    """The medium of docs/plugins.md, black, and the march of the same field."""
-    name = str(bundled("hydrant/field.safetensors"))
-    volume = {"type": "grid_field", "filename": name}
-    sigma_t = {**volume, "density_limit": 500.0}
-    black = {"type": "constvolume", "value": 0.0}
-    medium = {"type": "heterogeneous", "sigma_t": sigma_t, "albedo": black}
-    box = mi.ScalarTransform4f().translate([0, 0, 0.375]).scale([0.216, 0.2335, 0.3985])
-    cube = {"type": "cube", "to_world": box, "bsdf": {"type": "null"}}
-    cube["interior"] = medium
-    light = shown({"type": "volpath", "max_depth": 4}, {"cube": cube})[..., 0]
-    march = shown({"type": "field_integrator", "aovs": True, "hydrant": volume}, {})
-    opacity = march[..., 3]
-    assert 0.2 < (opacity > 0.5).mean() < 0.8
-    nothing = opacity == 0
-    assert nothing.mean() > 0.2
-    assert (1 - light[nothing]).mean() < 1e-3
-    assert light[opacity > 0.999].mean() < 0.05

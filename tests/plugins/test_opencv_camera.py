@@ -1,169 +1,167 @@
-"""The sensor `opencv_camera` against OpenCV's projection, and as a scene's sensor."""
+"""The sensor `opencv_camera` against float64 references and the stock `perspective`."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers.camera_scenes import (
-    CROP,
-    EYE,
-    INTEGRATORS,
-    LENS,
-    WIDTH,
-    film,
-    grid_of_pixels,
-    load,
-    rays,
-    sensor,
-    world,
+from support.reference.derivatives import RGB, SPECTRAL
+from support.worlds import cameras as cams
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.render.camera.conventions import from_mitsuba, mitsuba_sensor_dict
+from mi_nerfattack.render.camera.intrinsics import Camera, look_at
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+LENSES = pytest.mark.parametrize(
+    "camera", [cams.RADIAL, cams.WIDE], ids=["radial", "fisheye"]
 )
+POSE = look_at([1.0, 2, 3], [0, 0, 0])
 
 
-def opencv_pixels(points: np.ndarray) -> np.ndarray:
-    """Project points (n, 3) of Mitsuba's camera frame with OpenCV, (n, 2)."""
-    import cv2
-
-    # OpenCV counts from the centre of the first pixel.
-    matrix = np.array(
-        [
-            [LENS["fx"], 0, LENS["cx"] - 0.5],
-            [0, LENS["fy"], LENS["cy"] - 0.5],
-            [0, 0, 1],
-        ]
-    )
-    lens = np.array([LENS[name] for name in ("k1", "k2", "p1", "p2")])
-    axes = points * [-1.0, -1.0, 1.0]
-    projected = cv2.projectPoints(axes, np.zeros(3), np.zeros(3), matrix, lens)[0]
-    return projected[:, 0] + 0.5
+def made(camera: Camera, **crop: Any) -> mi.Sensor:
+    return cams.load(mitsuba_sensor_dict(camera, POSE, 1, crop))
 
 
-# Against OpenCV
+def local(direction: Any) -> np.ndarray:
+    """Turn directions of the world into right, down, forward of the camera, (n, 3)."""
+    return direction.numpy().T.astype(np.float64) @ POSE[:3, :3]
 
 
-@pytest.mark.parametrize("more", [{}, CROP], ids=["full", "crop"])
-def test_rays_project_back_with_opencv(variant: str, more: Any) -> None:
-    camera = load(sensor({"type": "opencv_camera", **LENS}, **more))
-    pixel = grid_of_pixels()
-    ray, _ = rays(camera, pixel)
-    to_local = np.linalg.inv(np.array(camera.world_transform().matrix).reshape(4, 4))
-    local = ray.d.numpy().T.astype(np.float64) @ to_local[:3, :3].T
-    np.testing.assert_allclose(opencv_pixels(local), pixel, atol=1e-4)
-
-
-def test_ray_differentials_are_the_next_pixels(variant: str) -> None:
-    camera = load(sensor({"type": "opencv_camera", **LENS}))
-    pixel = grid_of_pixels() * 0.9
-    ray, _ = rays(camera, pixel)
-    for name, step in (("d_x", [0.25, 0]), ("d_y", [0, 0.25])):
-        # The differential is the tangent: central differences within a pixel.
-        ahead, back = (rays(camera, pixel + sign * np.array(step)) for sign in (1, -1))
-        expected = (ahead[0].d - back[0].d).numpy() / 0.5
-        tangent = (getattr(ray, name) - ray.d).numpy()
-        size = np.linalg.norm(expected, axis=0)
+@LENSES
+@pytest.mark.parametrize("crop", [{}, cams.CROP], ids=["full", "crop"])
+def test_rays_and_differentials_look_where_the_lens_says(camera, crop) -> None:
+    found = made(camera, **crop)
+    back, pose = from_mitsuba(found)
+    np.testing.assert_allclose(back.distortion, camera.distortion, rtol=1e-6)
+    np.testing.assert_allclose(pose, POSE, atol=1e-6)
+    u, v = cams.pixels(camera)
+    ray, _ = cams.rays(found, np.stack([u, v], 1))
+    expected = cams.directions(camera, u, v)
+    np.testing.assert_allclose(local(ray.d), expected, atol=3e-6)
+    # Rays start at the near plane, of a fisheye on a sphere.
+    offset = local(ray.o - found.world_transform().translation())
+    reach = np.linalg.norm(offset, axis=1) if camera.is_fisheye else offset[:, 2]
+    np.testing.assert_allclose(reach, 1e-2, rtol=1e-4)
+    for there, (a, b) in ((ray.d_x, (1, 0)), (ray.d_y, (0, 1))):
+        if camera.is_fisheye:
+            next_pixel = cams.directions(camera, u + a, v + b)
+            np.testing.assert_allclose(local(there), next_pixel, atol=3e-6)
+            continue
+        ahead, behind = (
+            cams.directions(camera, u + s * a, v + s * b) for s in (0.25, -0.25)
+        )
+        tangent = (ahead - behind) / 0.5
         # A unit vector of the next pixel differs by the curvature of the sphere.
-        assert np.all(np.abs(tangent - expected) < 0.04 * size)
+        error = np.abs(local(there) - expected - tangent)
+        assert np.all(error < 0.04 * np.linalg.norm(tangent, axis=1)[:, None])
 
 
-def test_directions_are_rays_reversed(variant: str) -> None:
-    camera = load(sensor({"type": "opencv_camera", **LENS}, **CROP))
-    offset, size = np.array([15.0, 7.0]), np.array([20, 16])
-    pixel = offset + np.random.default_rng(1).uniform(0.02, 0.98, (200, 2)) * size
-    ray, _ = rays(camera, pixel)
+@LENSES
+def test_points_are_connected_to_the_pixels_that_show_them(camera) -> None:
+    corner, size = np.array([15.0, 7.0]), np.array([20, 16])
+    found = made(camera, **cams.CROP)
+    place = corner + np.random.default_rng(1).uniform(0.02, 0.98, (200, 2)) * size
+    ray, _ = cams.rays(found, place)
     it = dr.zeros(mi.Interaction3f, 200)
     it.p = ray(mi.Float(2.5))
-    ds, weight = camera.sample_direction(it, mi.Point2f(0))
+    ds, weight = found.sample_direction(it, mi.Point2f(0))
     assert np.all(np.array(ds.pdf) == 1)
-    np.testing.assert_allclose(ds.uv.numpy().T, pixel - offset, atol=2e-3)
+    np.testing.assert_allclose(ds.uv.numpy().T, place - corner, atol=2e-3)
     np.testing.assert_allclose(ds.d.numpy(), -ray.d.numpy(), atol=1e-5)
     # Importance: samples of the window per solid angle, over squared distance.
-    steps = 0.25 * np.eye(2)
+    u, v = place.T
     by = [
-        (rays(camera, pixel + s)[0].d - rays(camera, pixel - s)[0].d).numpy() / 0.5
-        for s in steps
+        (cams.directions(camera, u + a, v + b) - cams.directions(camera, u - a, v - b))
+        / 2e-3
+        for a, b in ((1e-3, 0), (0, 1e-3))
     ]
-    solid_angle = np.linalg.norm(np.cross(by[0].T, by[1].T), axis=1)
+    solid_angle = np.linalg.norm(np.cross(*by), axis=1)
     expected = 1 / (solid_angle * size.prod() * ds.dist.numpy() ** 2)
     np.testing.assert_allclose(weight.x.numpy(), expected, rtol=2e-3)
 
 
-def test_points_that_fold_into_the_image_are_not_seen(variant: str) -> None:
+def test_points_that_fold_into_the_image_are_not_seen() -> None:
     # With k1 < 0 the lens maps far directions back into the image: at x = 3,
     # x (1 + k1 x^2) = 0.3. OpenCV projects them there, but no ray goes that way.
     folding = {"type": "opencv_camera", "fx": 60.0, "k1": -0.1}
     it = dr.zeros(mi.Interaction3f, 1)
-    camera = load({**folding, "film": film()})
+    camera = cams.load({**folding, "film": cams.film()})
     for x, seen in ((0.29, True), (3.0, False)):
         it.p = mi.Point3f(x, 0, 1)
         ds, weight = camera.sample_direction(it, mi.Point2f(0))
-        assert abs(ds.uv.x[0] - WIDTH / 2) < WIDTH / 2
+        assert abs(ds.uv.x[0] - cams.WIDTH / 2) < cams.WIDTH / 2
         assert (ds.pdf[0] > 0, weight.x[0] > 0) == (seen, seen)
 
 
 # Derivatives and kernels
 
 
-@pytest.mark.parametrize("name", [*LENS, "to_world"])
-def test_rays_derivative(variant: str, name: str) -> None:
-    pixel = grid_of_pixels(8.0) * 0.95
-    towards = np.random.default_rng(0).normal(size=(3, len(pixel)))
-
-    def along(shift: Any) -> Any:
-        camera = load(sensor({"type": "opencv_camera", **LENS}))
-        params = mi.traverse(camera)
-        if name == "to_world":
-            moved = mi.Transform4f().rotate([0, 1, 0], shift)
-            params[name] = moved @ mi.Transform4f().look_at(EYE, [0, 0, 0], [0, 1, 0])
-        else:
-            params[name] = mi.Float(LENS[name]) + shift
-        params.update()
-        return rays(camera, pixel)[0].d
-
+@pytest.mark.parametrize(
+    ("camera", "name"),
+    [(cams.RADIAL, name) for name in (*cams.LENS, "to_world")]
+    + [(cams.WIDE, name) for name in ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_rays_derivative(camera: Camera, name: str) -> None:
+    u, v = cams.pixels(camera)
+    towards = np.random.default_rng(0).normal(size=(len(u), 3))
+    loaded = made(camera)
+    params = mi.traverse(loaded)
     shift = mi.Float(0)
     dr.enable_grad(shift)
-    direction = along(shift)
+    if name == "to_world":
+        params[name] = mi.AffineTransform4f().rotate([0, 1, 0], shift) @ params[name]
+    else:
+        params[name] = params[name] + shift
+    params.update()
+    direction = cams.rays(loaded, np.stack([u, v], 1))[0].d
     dr.forward(shift, dr.ADFlag.ClearEdges)
-    found = (dr.grad(direction).numpy() * towards).sum()
-    step = 0.05 if name[0] in "fct" else 5e-3
-    ahead, back = (along(mi.Float(s)).numpy().astype(float) for s in (step, -step))
-    expected = ((ahead - back) * towards).sum() / (2 * step)
-    np.testing.assert_allclose(found, expected, rtol=2e-3)
+    found = (dr.grad(direction).numpy().T * towards).sum()
+
+    def projected(step: float) -> float:
+        lens, c, s = camera, np.cos(np.radians(step)), np.sin(np.radians(step))
+        turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+        if name != "to_world":
+            lens, turn = (
+                replace(camera, **{name: getattr(camera, name) + step}),
+                np.eye(3),
+            )
+        shown = cams.directions(lens, u, v) @ (turn @ POSE[:3, :3]).T
+        return (shown * towards).sum()
+
+    step = 1e-5
+    expected = (projected(step) - projected(-step)) / (2 * step)
+    assert found == pytest.approx(expected, rel=1e-3)
 
 
-@pytest.mark.parametrize("lens", [{"fx": 30.0}, LENS], ids=["pinhole", "lens"])
-def test_nothing_is_compiled_for_another_pose_or_lens(variant: str, lens: Any) -> None:
-    camera = sensor({"type": "opencv_camera", **lens}, width=31, height=17)
-    scene = world(camera, INTEGRATORS["prb"])
+def test_nothing_is_compiled_for_another_pose_or_lens() -> None:
+    camera = cams.sensor({"type": "opencv_camera", **cams.LENS}, width=31, height=17)
+    scene = cams.world(camera, cams.INTEGRATORS["prb"])
     params = mi.traverse(scene)
 
     def frame(index: int) -> np.ndarray:
         eye = [1.0, index, -4.0]
         params["eye.to_world"] = mi.Transform4f().look_at(eye, [0, 0, 0], [0, 1, 0])
-        params["eye.fx"] = 31.0 + index
-        for name in ("k1", "p2"):
-            if name in lens:
-                params[f"eye.{name}"] = lens[name] + 1e-3 * index
+        for name, step in (("fx", 1.0), ("k1", 1e-3), ("p2", 1e-3)):
+            params[f"eye.{name}"] = cams.LENS[name] + step * index
         params.update()
         return np.array(mi.render(scene, spp=2, seed=1))
 
-    def kernels(index: int) -> tuple[set[str], np.ndarray]:
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            dr.kernel_history_clear()
-            image = frame(index)
-            history = dr.kernel_history()
-        return {k["hash"] for k in history if k["type"] == dr.KernelType.JIT}, image
-
-    # By their hash: what another process compiled comes from a cache on disk. The
-    # second frame of a scene differs from the first with the stock sensor too.
-    kernels(1)
-    known, image = kernels(2)
-    for index in (3, 4):
-        later, other = kernels(index)
-        assert later and later <= known
-        assert abs(other - image).max() > 0.1
+    # The second frame of a scene differs from the first with the stock sensor too.
+    frame(1)
+    image = frame(2)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        assert abs(frame(3) - image).max() > 0.1
+        history = dr.kernel_history((dr.KernelType.JIT,))
+    # What another process compiled comes from a cache on disk.
+    assert history and all(k["cache_hit"] and not k["cache_disk"] for k in history)
 
 
 # Properties
@@ -177,63 +175,104 @@ BORDER = {"type": "hdrfilm", "width": 48, "height": 32, "sample_border": True}
     ("more", "message"),
     [
         ({"fx": -3.0}, "camera.fx: -3.0; must be positive"),
-        ({"fy": 0.0}, "camera.fy: 0.0; must be positive"),
         ({"cx": float("nan")}, "camera.cx: nan; must be finite"),
         ({"k1": -5.0}, "folds the image over itself"),
         ({"k1": -0.155, "film": BORDER}, "folds the image over itself"),
         ({"near_clip": 0.0}, "near_clip, far_clip: 0, .*expected 0 < near < far"),
         ({"near_clip": 2.0, "far_clip": 1.0}, "near_clip, far_clip: 2, 1"),
-        ({"k3": 0.1}, 'unreferenced property.*\n.*"k3"'),
+        ({"k3": 0.1}, "k3: not of this lens"),
+        ({"fisheye": True, "p1": 0.1}, "p1: not of this lens"),
         ({"fov": 40.0}, 'unreferenced property.*\n.*"fov"'),
+        ({"to_world": 2}, "takes rotation and translation"),
+        ({"fx": None}, 'property named "fx"'),
     ],
 )
-def test_wrong_properties(variant: str, more: Any, message: str) -> None:
+def test_wrong_properties(more: dict[str, Any], message: str) -> None:
+    wrong = {"type": "opencv_camera", "fx": 30.0, "film": cams.film(), **more}
+    if wrong["fx"] is None:
+        del wrong["fx"]
+    if "to_world" in wrong:
+        wrong["to_world"] = mi.ScalarTransform4f().scale(wrong["to_world"])
     with pytest.raises(RuntimeError, match=message):
-        load({"type": "opencv_camera", "fx": 30.0, "film": film(), **more})
+        cams.load(wrong)
 
 
-def test_border_counts_only_where_it_is_sampled(variant: str) -> None:
-    load({"type": "opencv_camera", "fx": 30.0, "k1": -0.155, "film": film()})
-
-
-def test_focal_length_is_required(variant: str) -> None:
-    with pytest.raises(RuntimeError, match='property named "fx"'):
-        load({"type": "opencv_camera", "film": film()})
-
-
-def test_scaled_pose_is_refused(variant: str) -> None:
-    scaled = mi.ScalarTransform4f().scale(2)
-    with pytest.raises(RuntimeError, match="takes rotation and translation"):
-        load({"type": "opencv_camera", "fx": 9.0, "to_world": scaled})
-
-
-def test_impossible_changes_are_refused(variant: str) -> None:
-    params = mi.traverse(load({"type": "opencv_camera", "fx": 30.0, "film": film()}))
-    for name, value, message in (
-        ("k1", -5.0, "folds"),
+def test_impossible_changes_are_refused() -> None:
+    # the border counts only where it is sampled
+    camera = {"type": "opencv_camera", "fx": 30.0, "k1": -0.155, "film": cams.film()}
+    params = mi.traverse(cams.load(camera))
+    for name, value, where in (
+        ("k1", -5.0, "camera.k1, k2, p1, p2"),
         ("fx", -1.0, "camera.fx"),
-        ("to_world", mi.Transform4f().scale(2), "rotation and translation"),
+        ("to_world", mi.Transform4f().scale(2), "to_world"),
     ):
         before = type(params[name])(params[name])
         params[name] = value
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(InputError) as caught:
             params.update()
+        assert caught.value.where == where
         params[name] = before
         params.update()
 
 
-def test_xml(variant: str) -> None:
-    scene = mi.load_string(
-        '<scene version="3.0.0"><sensor type="opencv_camera">'
-        '<float name="fx" value="250"/><float name="fy" value="252"/>'
-        '<float name="k1" value="-0.1"/><transform name="to_world"><lookat '
-        'origin="3, 1, 1.5" target="0, 0, 0" up="0, 0, 1"/></transform>'
-        '<film type="hdrfilm"><integer name="width" value="320"/>'
-        '<integer name="height" value="240"/></film></sensor></scene>',
-        parallel=False,
+def test_lens_is_in_the_middle_and_square_by_default() -> None:
+    text = str(mi.load_dict({"type": "opencv_camera", "fx": 600.0, "k1": -0.1}))
+    assert "fx=600, fy=600, cx=384, cy=288, k1=-0.1" in text
+
+
+# Against the stock `perspective`
+
+IN_COLOUR = pytest.mark.parametrize("each_variant", [*RGB, *SPECTRAL], indirect=True)
+
+
+@IN_COLOUR
+@pytest.mark.parametrize("more", [{}, cams.CROP], ids=["full", "crop"])
+def test_rays_of_the_stock_sensor(each_variant: str, more: Any) -> None:
+    ours, theirs = (
+        cams.load(cams.sensor(d, **more)) for d in (cams.PINHOLE, cams.STOCK)
     )
-    text = str(scene.sensors()[0])
-    assert "fx=250, fy=252, cx=160, cy=120, k1=-0.1" in text
-    camera = {"type": "opencv_camera", "fx": 600.0, "fy": 605.0, "k1": -0.1}
-    text = str(mi.load_dict(camera))
-    assert "fx=600, fy=605, cx=384, cy=288, k1=-0.1" in text
+    (a, weight_a), (b, weight_b) = (
+        cams.rays(s, cams.grid_of_pixels()) for s in (ours, theirs)
+    )
+    for name in ("o", "d", "maxt", "d_x", "d_y", "o_x", "wavelengths"):
+        x, y = (np.array(getattr(ray, name)) for ray in (a, b))
+        np.testing.assert_allclose(x, y, rtol=2e-6, atol=1e-6, err_msg=name)
+    np.testing.assert_allclose(np.array(weight_a), np.array(weight_b), rtol=1e-6)
+
+
+@IN_COLOUR
+@pytest.mark.parametrize("more", [{}, cams.CROP], ids=["full", "crop"])
+def test_directions_of_the_stock_sensor(each_variant: str, more: Any) -> None:
+    # Centred: the stock sensor leaves out a strip where the principal point is not.
+    centred = {"cx": 0.5 * cams.WIDTH, "cy": 0.5 * cams.HEIGHT}
+    shifted = ("principal_point_offset_x", "principal_point_offset_y")
+    stock = {key: value for key, value in cams.STOCK.items() if key not in shifted}
+    ours = cams.load(cams.sensor({**cams.PINHOLE, **centred}, **more))
+    theirs = cams.load(cams.sensor(stock, **more))
+    spread = np.random.default_rng(0).normal(size=(3, 500)) * 1.5
+    it = dr.zeros(mi.Interaction3f, 500)
+    it.p = mi.Point3f(spread.astype(np.float32))
+    (a, a_weight), (b, b_weight) = (
+        s.sample_direction(it, mi.Point2f(0)) for s in (ours, theirs)
+    )
+    seen = np.array(b.pdf) > 0
+    np.testing.assert_array_equal(np.array(a.pdf) > 0, seen)
+    assert 0.05 < seen.mean() < 0.95
+    for name in ("uv", "d", "dist"):
+        x, y = (np.array(getattr(ds, name))[..., seen] for ds in (a, b))
+        np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-5, err_msg=name)
+    x, y = (np.array(mi.Spectrum(w)[0])[seen] for w in (a_weight, b_weight))
+    np.testing.assert_allclose(x, y, rtol=1e-5)
+
+
+@IN_COLOUR
+@pytest.mark.parametrize("kind", ["aov", "prb"])
+def test_image_of_the_stock_sensor(each_variant: str, kind: str) -> None:
+    more = {"rfilter": {"type": "gaussian"}, "sample_border": True, **cams.CROP}
+    scenes = (
+        cams.world(cams.sensor(d, **more), cams.INTEGRATORS[kind])
+        for d in (cams.PINHOLE, cams.STOCK)
+    )
+    ours, theirs = (np.array(mi.render(scene, spp=4, seed=3)) for scene in scenes)
+    assert np.nanmax(theirs) > 0.5
+    np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-4)

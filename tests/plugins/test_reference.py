@@ -14,7 +14,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import small_fields, splat_files
+from support.files import objects as splat_files
+from support.worlds import fields as small_fields
 
 from mi_nerfattack import plugins
 from mi_nerfattack.fields import save_field
@@ -31,33 +32,17 @@ KINDS = {
     "opencv_camera": "sensor",
 }
 # What Mitsuba's own classes read of some plugin: C++ tells nobody what it asks for.
+NUMBERS = """aperture_radius far_clip focus_distance fov max_value near_clip timeout
+    principal_point_offset_x sampling_weight scale shutter_close shutter_open""".split()
+COUNTS = "block_size max_depth rr_depth samples_per_pass".split()
+FLAGS = "accel flip_normals hide_emitters raw use_grid_bbox".split()
 STOCK: dict[str, Any] = {
-    "accel": True,
-    "aperture_radius": 0.1,
-    "block_size": 32,
-    "far_clip": 1e3,
-    "filter_type": "nearest",
-    "flip_normals": False,
-    "focus_distance": 1.0,
-    "fov": 40.0,
-    "fov_axis": "x",
-    "hide_emitters": True,
-    "max_depth": 4,
-    "max_value": 1.0,
-    "near_clip": 0.1,
-    "principal_point_offset_x": 0.1,
-    "raw": True,
-    "rr_depth": 4,
-    "samples_per_pass": 1,
-    "sampling_weight": 2.0,
-    "scale": 2.0,
-    "shutter_close": 1.0,
-    "shutter_open": 0.0,
+    **dict.fromkeys(NUMBERS, 1.0),
+    **dict.fromkeys(COUNTS, 4),
+    **dict.fromkeys(FLAGS, True),
+    **{"filter_type": "nearest", "fov_axis": "x", "wrap_mode": "clamp"},
     "srf": {"type": "d65"},
-    "timeout": 9.0,
     "to_world": None,  # the identity: Mitsuba has no transforms before a variant
-    "use_grid_bbox": True,
-    "wrap_mode": "clamp",
 }
 
 
@@ -134,32 +119,24 @@ def queried_in_python(name: str) -> set[str]:
     """Construct a plugin of properties that note what Python asks them for."""
     asked: set[str] = set()
 
-    class Recorder(mi.Properties):
-        def get(self, key: str, *default: Any) -> Any:
+    def noting(method: str) -> Any:
+        def note(self: mi.Properties, key: str, *more: Any) -> Any:
             asked.add(key)
-            return super().get(key, *default)
+            return getattr(mi.Properties, method)(self, key, *more)
 
-        def __getitem__(self, key: str) -> Any:
-            asked.add(key)
-            return super().__getitem__(key)
+        return note
 
-        def __contains__(self, key: str) -> bool:
-            asked.add(key)
-            return super().__contains__(key)
-
-        def has_property(self, key: str) -> bool:
-            asked.add(key)
-            return super().has_property(key)
-
+    methods = ("get", "__getitem__", "__contains__", "has_property")
+    Recorder = type("Recorder", (mi.Properties,), {m: noting(m) for m in methods})
     cls = type(load(name))
     props = Recorder(name)
-    for key, value in minimal(name).items():
+    more = {}
+    if name == "opencv_camera":
+        more = {"film": {"type": "hdrfilm"}, "sampler": {"type": "independent"}}
+    for key, value in (minimal(name) | more).items():
         if key != "type":
             is_nested = isinstance(value, dict)
             props[key] = mi.load_dict(value, parallel=False) if is_nested else value
-    if name == "opencv_camera":
-        props["film"] = mi.load_dict({"type": "hdrfilm"})
-        props["sampler"] = mi.load_dict({"type": "independent"})
     cls(props)
     return asked
 

@@ -1,36 +1,32 @@
-"""Policies with memory: frame stacks and hidden states and their derivatives."""
+"""Policies with memory: frame stacks, hidden states, and derivatives through time."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 import torch
-from helpers.derivatives import central_difference
+from support.faults.refusals import refusals
+from support.reference import loop as analytic
+from support.reference.derivatives import central_difference
+from support.worlds.loops import ADJOINTS, Wave, assert_close, expected_gradient, flat
 from torch import nn
 
-from mi_nerfattack.errors import InputError
+from mi_nerfattack.policy import preprocess as pre
 from mi_nerfattack.policy.goals import IntegerGoal, NoGoal, OneHotGoal
 from mi_nerfattack.policy.pilotnet import PilotNet
-from mi_nerfattack.policy.preprocess import (
-    Crop,
-    Preprocess,
-    Resize,
-    channels_last,
-    to_grey,
-)
 from mi_nerfattack.policy.torch_policy import TorchPolicy
+from mi_nerfattack.rollout.function import Rollout
+from mi_nerfattack.vehicle.dynamics import to_state
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 SIZE = (6, 8)
 TYPES = {
-    torch.float32: (
-        lambda a: mi.TensorXf(a.astype("f4")),
-        lambda a: mi.Float(a),
-        1e-5,
-    ),
+    torch.float32: (lambda a: mi.TensorXf(a.astype("f4")), lambda a: mi.Float(a), 1e-5),
     torch.float64: (
         lambda a: dr.llvm.ad.TensorXf64(a),
         lambda a: dr.llvm.ad.Float64(a),
@@ -40,8 +36,6 @@ TYPES = {
 
 
 class Linear(nn.Module):
-    """A fixed weight for each value of the input."""
-
     def __init__(self, *shape):
         super().__init__()
         self.weight = nn.Parameter(torch.randn(shape) / 4)
@@ -74,12 +68,12 @@ def recurrent(dtype=torch.float32):
 
 
 def stacked(dtype=torch.float32):
-    preprocess = Preprocess([Resize(5, 4)], frames=3, stride=2)
+    preprocess = pre.Preprocess([pre.Resize(5, 4)], frames=3, stride=2)
     return TorchPolicy(Linear(9, 4, 5).to(dtype), NoGoal(), preprocess)
 
 
 def pilotnet(dtype=torch.float32):
-    preprocess = Preprocess([Resize(200, 66)])
+    preprocess = pre.Preprocess([pre.Resize(200, 66)])
     return TorchPolicy(PilotNet().to(dtype), IntegerGoal(3), preprocess)
 
 
@@ -129,69 +123,25 @@ def test_reverse_mode_of_a_step_equals_differences(make, dtype, rng):
     assert sum(p.sum() for p in products) == expected
 
 
-@pytest.mark.parametrize("make", [recurrent, stacked])
-def test_reverse_mode_through_time_equals_differences(make, rng):
-    """Chain step_vjp over five steps; compare with differences of the whole chain."""
-    tensor, row, _ = TYPES[torch.float64]
-    policy = make(torch.float64)
-    values = [rng.random((2, *SIZE, 3)) for _ in range(5)]
-    directions = [rng.normal(size=(2, *SIZE, 3)) for _ in range(5)]
-    weights = rng.normal(size=(5, 2))
-
-    def objective(step):
-        images = [tensor(v + step * d) for v, d in zip(values, directions, strict=True)]
-        return float(np.sum(weights * drive(policy, images)[0]))
-
-    images = [tensor(v) for v in values]
-    _, memories = drive(policy, images)
-    d_memory, total = (), 0.0
-    for i in reversed(range(5)):
-        weight = row(weights[i])
-        d_image, d_memory = policy.step_vjp(images[i], 1, memories[i], weight, d_memory)
-        total += float((d_image.numpy() * directions[i]).sum())
-    numeric = (objective(1e-5) - objective(-1e-5)) / 2e-5
-    assert total == pytest.approx(numeric, rel=1e-7)
-
-
-def test_control_and_vjp_are_those_of_first_images(rng):
-    policy = recurrent()
-    image, weight = mi.TensorXf(rng.random((2, *SIZE, 3), "f4")), mi.Float(1, -1)
-    memory = policy.initial_memory(2)
-    control, d_image = policy.vjp(image, 0, weight)
-    # torch fuses the LSTM where it records no graph: the last bit may differ
-    np.testing.assert_allclose(control, policy.control(image, 0), atol=1e-6)
-    np.testing.assert_allclose(control, policy.step(image, 0, memory)[0], atol=1e-6)
-    expected, _ = policy.step_vjp(image, 0, memory, weight, ())
-    np.testing.assert_array_equal(d_image, expected)
-
-
-def test_frame_stack_repeats_the_first_image_and_keeps_the_stride(rng):
-    preprocess = Preprocess(frames=3, stride=2)
-    frames = torch.arange(7.0)[:, None, None, None, None].expand(-1, 1, 1, 1, 1)
-    past = torch.zeros(1, 0, 0, 0, 0)
-    seen = []
-    for frame in frames:
-        stacked, past = preprocess.stack(frame, past)
+def test_frame_stack_repeats_the_first_image_and_keeps_the_stride():
+    preprocess = pre.Preprocess(frames=3, stride=2)
+    past, seen = torch.zeros(1, 0, 0, 0, 0), []
+    for frame in torch.arange(7.0):
+        stacked, past = preprocess.stack(frame.expand(1, 1, 1, 1), past)
         assert past.shape[1] <= preprocess.history == 4
-        seen.append(stacked.flatten().tolist())
+        seen.append([int(value) for value in stacked.flatten()])
     # no frame that has dropped out is kept
     assert past.untyped_storage().nbytes() == past.numel() * 4 == 4 * 4
-    assert seen == [
-        [0, 0, 0],
-        [0, 0, 1],
-        [0, 0, 2],
-        [0, 1, 3],
-        [0, 2, 4],
-        [1, 3, 5],
-        [2, 4, 6],
-    ]
+    first = [[0, 0, 0], [0, 0, 1], [0, 0, 2], [0, 1, 3]]
+    assert seen == [*first, [0, 2, 4], [1, 3, 5], [2, 4, 6]]
 
 
 def test_planes_are_the_stack_after_its_transforms(rng):
-    stack = Preprocess([Crop(2, 0, 1, 1), to_grey()], frames=3, layout=channels_last)
+    stack = pre.Preprocess(
+        [pre.Crop(2, 0, 1, 1), pre.to_grey()], frames=3, layout=pre.channels_last
+    )
     policy = TorchPolicy(nn.Flatten(), NoGoal(), stack, output=0)
-    height, width = 6, 8
-    images = [rng.random((2, height, width, 3), "f4") for _ in range(4)]
+    images = [rng.random((2, *SIZE, 3), "f4") for _ in range(4)]
     memory = policy.initial_memory(2)
     for image in map(mi.TensorXf, images[:3]):
         _, memory = policy.step(image, 0, memory)
@@ -201,46 +151,94 @@ def test_planes_are_the_stack_after_its_transforms(rng):
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-def test_memory_is_left_alone(rng):
-    policy = recurrent()
-    images = [mi.TensorXf(rng.random((3, *SIZE, 3), "f4")) for _ in range(2)]
-    _, memories = drive(policy, images)
-    before = [part.clone() for part in memories[1]]
-    first, _ = policy.step(images[1], 1, memories[1])
-    policy.step_vjp(images[1], 1, memories[1], mi.Float(1, 1, 1), ())
-    again, _ = policy.step(images[1], 1, memories[1])
-    np.testing.assert_array_equal(first, again)
-    assert all(map(torch.equal, before, memories[1]))
-    assert TorchPolicy(Linear(3, *SIZE), NoGoal()).initial_memory(2) == ()
+def of_shape(*shape):
+    return lambda: TorchPolicy(Recurrent(), NoGoal(), recurrent=[shape])
 
 
-def test_vehicles_do_not_mix(rng):
-    """A batch gives what its members give alone."""
-    policy = recurrent(torch.float64)
-    tensor = TYPES[torch.float64][0]
-    values = [rng.random((2, *SIZE, 3)) for _ in range(3)]
-    together, _ = drive(policy, [tensor(v) for v in values])
-    for i in range(2):
-        alone, _ = drive(policy, [tensor(v[i : i + 1]) for v in values])
-        np.testing.assert_allclose(
-            np.ravel(alone), np.array(together)[:, i], rtol=1e-12
-        )
+def too_few(kind, goals=(2, 0)):
+    return lambda: kind(2).arguments(torch.tensor(goals), torch.tensor(goals))
 
 
-@pytest.mark.parametrize("shape", [(3, 4), (-1, -1), (-1, 0)])
-def test_hidden_shapes_need_one_place_for_the_vehicles(shape):
-    with pytest.raises(InputError, match="one -1"):
-        TorchPolicy(Recurrent(), NoGoal(), recurrent=[shape])
+test_goals_and_shapes_that_are_refused = refusals(
+    *((too_few(kind), "below 2") for kind in (IntegerGoal, OneHotGoal)),
+    *((lambda k=kind: k(0), "at least 1") for kind in (IntegerGoal, OneHotGoal)),
+    *((of_shape(*shape), "one -1") for shape in ((3, 4), (-1, -1), (-1, 0))),
+)
 
 
-def test_goals_as_networks_take_them():
-    goals, like = torch.tensor([2, 0]), torch.zeros(1, dtype=torch.float64)
-    assert torch.equal(IntegerGoal(3).arguments(goals, like)[0], goals)
-    (rows,) = OneHotGoal(3).arguments(goals, like)
-    assert rows.tolist() == [[0, 0, 1], [1, 0, 0]] and rows.dtype == torch.float64
-    assert NoGoal().arguments(goals, like) == ()
-    for kind in (IntegerGoal, OneHotGoal):
-        with pytest.raises(InputError, match="below 2"):
-            kind(2).arguments(goals, like)
-        with pytest.raises(InputError, match="at least 1"):
-            kind(0)
+HORIZON = 7
+
+
+class Gated(nn.Module):
+    def __init__(self):
+        super().__init__()
+        size = 3 * analytic.HEIGHT * analytic.WIDTH
+        self.cell = nn.GRUCell(size + 3, 6)
+        self.head = nn.Linear(6, 1)
+
+    def forward(self, image, goal, hidden):
+        hidden = self.cell(torch.cat([3 * image.flatten(1), goal], 1), hidden)
+        return 2 * torch.tanh(2 * self.head(hidden)), hidden
+
+
+class Dense(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.head = nn.Linear(9 * 2 * 4, 1)
+
+    def forward(self, image):
+        return torch.tanh(2 * self.head(image.flatten(1)))
+
+
+def policies():
+    torch.manual_seed(4)
+    transforms = [pre.Resize(4, 2), pre.to_yuv(), pre.Normalise(2.0, (0.5,), (0.7,))]
+    stack = pre.Preprocess(transforms, 3, 2)
+    return {
+        "recurrent": TorchPolicy(Gated().double(), OneHotGoal(3), recurrent=[(-1, 6)]),
+        "stacked": TorchPolicy(Dense().double(), NoGoal(), stack, control_scale=-1.5),
+    }
+
+
+class Carried(nn.Module):
+    """A policy's network that keeps its memory itself, in the graph of a drive."""
+
+    def __init__(self, policy):
+        super().__init__()
+        self.policy, self.frames, self.hidden = policy, [], None
+
+    def forward(self, image, goal):
+        policy, preprocess = self.policy, self.policy.preprocess
+        frame = image.permute(0, 2, 3, 1)
+        self.frames.append(preprocess.transform(frame))
+        last, stride = len(self.frames) - 1, preprocess.stride
+        ages = [i * stride for i in reversed(range(preprocess.frames))]
+        stack = torch.cat([self.frames[max(0, last - age)] for age in ages], 1)
+        if self.hidden is None:
+            self.hidden = [torch.zeros(len(image), s[1]) for s in policy.recurrent]
+        hidden = [part.double() for part in self.hidden]
+        goals = policy.goal.arguments(goal, image)
+        result = policy.module(stack, *goals, *hidden)
+        result = result if isinstance(result, tuple) else (result,)
+        self.hidden = list(result[1:])
+        return policy.control_scale * result[0][:, 0]
+
+
+def make_pair(name):
+    policy = policies()[name]
+    loop, twin = analytic.make_pair("ackermann", substeps=2, delay=1)
+    loop = replace(loop, policy=policy)
+    twin = replace(twin, module=Carried(policy))
+    return loop, twin, loop.dynamics.extend(analytic.random_poses(3))
+
+
+@pytest.mark.parametrize("adjoint", ADJOINTS.values(), ids=ADJOINTS)
+@pytest.mark.parametrize("attached", [True, False])
+@pytest.mark.parametrize("name", ["recurrent", "stacked"])
+def test_gradients_go_through_the_memory(name, attached, adjoint):
+    loop, twin, initial = make_pair(name)
+    value, expected = expected_gradient(loop, twin, initial, HORIZON, attached)
+    rollout = Rollout(loop, Wave(), HORIZON, adjoint=adjoint, attached=attached)
+    evaluation = rollout.run(to_state(initial))
+    assert evaluation.value == pytest.approx(value, rel=1e-12)
+    assert_close(flat(rollout.gradient(evaluation)), expected, 1e-9)

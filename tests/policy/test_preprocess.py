@@ -6,38 +6,21 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from support.faults.refusals import refusals
 
-from mi_nerfattack.errors import InputError
-from mi_nerfattack.policy.preprocess import (
-    Crop,
-    FractionalCrop,
-    Normalise,
-    Preprocess,
-    Resize,
-    ToLinear,
-    antialias,
-    area,
-    bilinear,
-    channels_first,
-    channels_last,
-    time_channels_last,
-    time_first,
-    to_bgr,
-    to_grey,
-    to_yuv,
-)
+from mi_nerfattack.policy import preprocess as pre
 
 STAGES = {
-    "crop": Crop(1, 2, 3, 0),
-    "fraction": FractionalCrop(0.25, 0.0, 0.1, 0.2),
-    "bilinear": Resize(5, 9, bilinear),
-    "antialias": Resize(5, 3, antialias),
-    "area": Resize(4, 3, area),
-    "linear": ToLinear(),
-    "yuv": to_yuv(),
-    "grey": to_grey(),
-    "bgr": to_bgr(),
-    "normalise": Normalise(255.0, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0)),
+    "crop": pre.Crop(1, 2, 3, 0),
+    "fraction": pre.FractionalCrop(0.25, 0.0, 0.1, 0.2),
+    "bilinear": pre.Resize(5, 9, pre.bilinear),
+    "antialias": pre.Resize(5, 3, pre.antialias),
+    "area": pre.Resize(4, 3, pre.area),
+    "linear": pre.ToLinear(),
+    "yuv": pre.to_yuv(),
+    "grey": pre.to_grey(),
+    "bgr": pre.to_bgr(),
+    "normalise": pre.Normalise(255.0, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0)),
 }
 
 
@@ -67,7 +50,8 @@ def applied(stage, image):
 
 
 @pytest.mark.parametrize(
-    ("stage", "code"), [(to_yuv(), cv2.COLOR_RGB2YUV), (to_grey(), cv2.COLOR_RGB2GRAY)]
+    ("stage", "code"),
+    [(pre.to_yuv(), cv2.COLOR_RGB2YUV), (pre.to_grey(), cv2.COLOR_RGB2GRAY)],
 )
 def test_colours_are_opencvs(stage, code, rng):
     image = picture(rng)
@@ -76,32 +60,49 @@ def test_colours_are_opencvs(stage, code, rng):
     np.testing.assert_allclose(applied(stage, image), expected, atol=1e-5)
 
 
-def test_bgr_and_linear(rng):
+def test_bgr_linear_crops_and_normalising(rng):
     image = picture(rng)
-    np.testing.assert_array_equal(applied(to_bgr(), image), image[..., ::-1])
-    levels = np.float32([0.0, 0.04045, 0.5, 1.0]).reshape(1, 4, 1).repeat(3, 2)
+    np.testing.assert_array_equal(applied(pre.to_bgr(), image), image[..., ::-1])
+    levels = np.float32([0.0, 0.04045, 0.1, 0.5, 1.0]).reshape(1, 5, 1).repeat(3, 2)
     # IEC 61966-2-1: 0.04045 / 12.92, and 0.5 has 21.4 % of the light
-    expected = [0.0, 0.0031308, 0.2140411, 1.0]
-    np.testing.assert_allclose(
-        applied(ToLinear(), levels)[0, :, 1], expected, atol=1e-7
-    )
+    expected = [0.0, 0.0031308, 0.0100228, 0.2140411, 1.0]
+    found = applied(pre.ToLinear(), levels)[0, :, 1]
+    np.testing.assert_allclose(found, expected, atol=1e-7)
+    cut = applied(pre.Crop(1, 2, 3, 4), image)
+    np.testing.assert_array_equal(cut, image[1:10, 3:16])
+    # 0.3 of 12 rows is 3.6: four; 0.125 of 20 columns is 2.5: three
+    cut = applied(pre.FractionalCrop(0.3, 0.0, 0.125, 0.0), image)
+    np.testing.assert_array_equal(cut, image[4:, 3:])
+    stage = pre.Normalise(255.0, (10.0, 20.0, 30.0), (2.0,))
+    expected = (255 * image - [10.0, 20.0, 30.0]) / 2
+    np.testing.assert_allclose(applied(stage, image), expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
     ("filter", "code", "size"),
     [
-        (bilinear, cv2.INTER_LINEAR, (7, 5)),
-        (bilinear, cv2.INTER_LINEAR, (41, 30)),
-        (area, cv2.INTER_AREA, (10, 4)),
-        (area, cv2.INTER_AREA, (7, 5)),
+        (pre.bilinear, cv2.INTER_LINEAR, (7, 5)),
+        (pre.bilinear, cv2.INTER_LINEAR, (41, 30)),
+        (pre.area, cv2.INTER_AREA, (10, 4)),
+        (pre.area, cv2.INTER_AREA, (7, 5)),
     ],
 )
 def test_resize_is_opencvs(filter, code, size, rng):
     image = picture(rng)
     expected = cv2.resize(image, size, interpolation=code)
     np.testing.assert_allclose(
-        applied(Resize(*size, filter), image), expected, atol=1e-5
+        applied(pre.Resize(*size, filter), image), expected, atol=1e-5
     )
+
+
+def test_layouts():
+    frames = torch.rand(2, 4, 3, 5, 6)
+    flat = pre.channels_first(frames)
+    assert flat.shape == (2, 12, 5, 6)
+    assert torch.equal(flat[:, 3:6], frames[:, 1])  # frame by frame, oldest first
+    assert torch.equal(pre.channels_last(frames), flat.permute(0, 2, 3, 1))
+    assert torch.equal(pre.time_first(frames), frames)
+    assert pre.time_channels_last(frames).shape == (2, 4, 5, 6, 3)
 
 
 def test_antialias_is_torchs(rng):
@@ -109,61 +110,21 @@ def test_antialias_is_torchs(rng):
     expected = torch.nn.functional.interpolate(
         planes, (66, 200), mode="bilinear", antialias=True
     )
-    torch.testing.assert_close(Resize(200, 66).apply(planes), expected)
+    torch.testing.assert_close(pre.Resize(200, 66).apply(planes), expected)
 
 
-def test_resize_to_the_same_size_is_nothing():
-    planes = torch.rand(1, 3, 4, 6)
-    assert Resize(6, 4).apply(planes) is planes
+def meets(stage, channels=3):
+    return lambda: stage().apply(torch.rand(1, channels, 8, 9))
 
 
-def test_crops():
-    planes = torch.arange(80.0).reshape(1, 1, 8, 10)
-    cut = Crop(1, 2, 3, 4).apply(planes)
-    assert torch.equal(cut, planes[:, :, 1:6, 3:6])
-    # 0.3 of 8 rows is 2.4: two; 0.25 of 10 columns is 2.5: three
-    cut = FractionalCrop(0.3, 0.0, 0.25, 0.0).apply(planes)
-    assert torch.equal(cut, planes[:, :, 2:, 3:])
-
-
-def test_normalise():
-    planes = torch.rand(2, 3, 4, 5, dtype=torch.float64)
-    stage = Normalise(255.0, (10.0, 20.0, 30.0), (2.0,))
-    expected = (255 * planes - torch.tensor([10.0, 20, 30])[:, None, None]) / 2
-    torch.testing.assert_close(stage.apply(planes), expected)
-
-
-def test_layouts():
-    frames = torch.rand(2, 4, 3, 5, 6)
-    flat = channels_first(frames)
-    assert flat.shape == (2, 12, 5, 6)
-    assert torch.equal(flat[:, 3:6], frames[:, 1])  # frame by frame, oldest first
-    assert torch.equal(channels_last(frames), flat.permute(0, 2, 3, 1))
-    assert torch.equal(time_first(frames), frames)
-    assert time_channels_last(frames).shape == (2, 4, 5, 6, 3)
-
-
-def test_stages_follow_each_other(rng):
-    image = torch.rand(1, 6, 8, 3)
-    preprocess = Preprocess([Crop(2, 0, 0, 0), to_grey(), Normalise(2.0)])
-    expected = 2 * (image[:, 2:] @ torch.tensor([0.299, 0.587, 0.114]))[:, None]
-    torch.testing.assert_close(preprocess.transform(image), expected)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Crop(-1, 0, 0, 0), "none below 0"),
-        (lambda: FractionalCrop(0.5, 0.5, 0, 0), "below 1"),
-        (lambda: Resize(0, 4), "at least 1"),
-        (lambda: Normalise(0.0), "scale 0"),
-        (lambda: Normalise(1.0, std=(0.0,)), "positive"),
-        (lambda: Preprocess(frames=0), "at least 1"),
-        (lambda: Crop(4, 4, 0, 0).apply(torch.rand(1, 3, 8, 9)), "9 x 8 pixels"),
-        (lambda: to_yuv().apply(torch.rand(1, 1, 8, 9)), "meets an image of 1"),
-        (lambda: Normalise(1.0, (0, 0)).apply(torch.rand(1, 3, 8, 9)), "2 channels"),
-    ],
+test_refusals = refusals(
+    (lambda: pre.Crop(-1, 0, 0, 0), "none below 0"),
+    (lambda: pre.FractionalCrop(0.5, 0.5, 0, 0), "below 1"),
+    (lambda: pre.Resize(0, 4), "at least 1"),
+    (lambda: pre.Normalise(0.0), "scale 0"),
+    (lambda: pre.Normalise(1.0, std=(0.0,)), "positive"),
+    (lambda: pre.Preprocess(frames=0), "at least 1"),
+    (meets(lambda: pre.Crop(4, 4, 0, 0)), "9 x 8 pixels"),
+    (meets(pre.to_yuv, 1), "meets an image of 1"),
+    (meets(lambda: pre.Normalise(1.0, (0, 0))), "2 channels"),
 )
-def test_refusals(make, message):
-    with pytest.raises(InputError, match=message):
-        make()

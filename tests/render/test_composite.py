@@ -1,4 +1,4 @@
-"""The depth composite against A.4 to A.6 written out by hand."""
+"""Composites: the depth composite against A.4 to A.6 by hand, and the interleaved."""
 
 from __future__ import annotations
 
@@ -6,17 +6,21 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import small_fields as small
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from support.worlds import fields as small
 
+from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.composite import (
     DepthComposite,
     Seen,
     depth_composite,
     sort_by_depth,
 )
-from mi_nerfattack.render.rays import March
+from mi_nerfattack.render.interleaved import InterleavedComposite
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March, Rays
+from mi_nerfattack.render.sums import absorption
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -33,22 +37,10 @@ def layer(colour: np.ndarray, opacity: float, depth: float) -> March:
     )
 
 
-def read(march: March) -> tuple[np.ndarray, float, float]:
+def read(one: March) -> tuple[np.ndarray, float, float]:
     """Return premultiplied radiance, opacity and depth of a one-ray march."""
-    radiance = march.radiance.numpy()[:, 0]
-    return radiance, float(march.opacity[0]), float(march.depth[0])
-
-
-def test_two_layers_are_a6_times_its_divisor() -> None:
-    front, back = (np.array([0.9, 0.2, 0.1]), 0.3), (np.array([0.1, 0.5, 0.8]), 0.6)
-    seen = depth_composite([layer(*back, depth=7.0), layer(*front, depth=4.0)])
-    a = 0.3 + 0.6 * (1 - 0.3)
-    colour = (front[0] * 0.3 + back[0] * 0.6 * (1 - 0.3)) / a  # A.6
-    radiance, opacity, depth = read(seen)
-    assert opacity == pytest.approx(a)
-    np.testing.assert_allclose(radiance, a * colour, rtol=1e-6)
-    # The mean of the depths, weighted by what each layer contributes.
-    assert depth == pytest.approx((4 * 0.3 + 7 * 0.42) / a)
+    radiance = one.radiance.numpy()[:, 0]
+    return radiance, float(one.opacity[0]), float(one.depth[0])
 
 
 def test_order_is_chosen_ray_by_ray() -> None:
@@ -98,59 +90,6 @@ def test_any_layers_against_a_sequential_fold(layers) -> None:
         np.testing.assert_allclose(parts, whole, atol=1e-5)
 
 
-def test_over_is_associative(rng: np.random.Generator) -> None:
-    a, b, c = [layer(rng.random(3), rng.random(), 1 + rng.random()) for _ in range(3)]
-    left, right = read(a.over(b).over(c)), read(a.over(b.over(c)))
-    for x, y in zip(left, right, strict=True):
-        np.testing.assert_allclose(x, y, rtol=1e-6)
-
-
-def leaves(rng: np.random.Generator, count: int = 16) -> list[np.ndarray]:
-    """Make radiance, opacity and moment (5, count) of three layers apart in depth."""
-    result = []
-    for k in range(3):
-        opacity = rng.uniform(0.2, 0.8, (1, count))
-        depth = rng.uniform(1, 2, (1, count)) + 3 * rng.permutation(3)[k]
-        result.append(
-            np.concatenate([rng.random((3, count)), opacity, opacity * depth])
-        )
-    return result
-
-
-def marches(values: list[np.ndarray]) -> list[March]:
-    """Make marches of (5, n) arrays."""
-    rows = [[mi.Float(row.astype(np.float32)) for row in v] for v in values]
-    return [March(mi.Color3f(*r[:3]), r[3], r[4]) for r in rows]
-
-
-def test_gradient_against_differences(rng: np.random.Generator) -> None:
-    base = leaves(rng)
-    tangent = [rng.normal(size=v.shape) for v in base]
-    cotangent = small.random_march(rng, 16)
-
-    def objective(s: float) -> float:
-        moved = [v + s * t for v, t in zip(base, tangent, strict=True)]
-        return small.pairing(depth_composite(marches(moved)), cotangent)
-
-    expected = (objective(1e-3) - objective(-1e-3)) / 2e-3
-    layers = marches(base)
-    dr.enable_grad(layers)
-    seen = depth_composite(layers)
-    dr.backward(
-        dr.sum(
-            dr.dot(seen.radiance, cotangent.radiance)
-            + seen.opacity * cotangent.opacity
-            + seen.moment * cotangent.moment
-        )
-    )
-    found = 0.0
-    for item, t in zip(layers, tangent, strict=True):
-        grad = dr.grad(item)
-        rows = [*grad.radiance, grad.opacity, grad.moment]
-        found += sum(float(r.numpy() @ t[k]) for k, r in enumerate(rows))
-    assert found == pytest.approx(expected, rel=2e-3)
-
-
 def test_layer_behind_an_opaque_one_has_no_gradient() -> None:
     front, back = layer(RED, 1.0, 2.0), layer(BLUE, 0.5, 3.0)
     dr.enable_grad(front, back)
@@ -159,3 +98,66 @@ def test_layer_behind_an_opaque_one_has_no_gradient() -> None:
     assert dr.grad(front.radiance).numpy().ravel() == pytest.approx([1, 1, 1])
     # Less of the front lets (0, 0, 0.5) through, summed over the colours.
     assert dr.grad(front.opacity)[0] == pytest.approx(-0.5)
+
+
+# Interleaved
+
+
+def make_rays(rng: np.random.Generator, t_max: float = 10.0) -> Rays:
+    origin, direction, _, _ = small.fan(rng, 24)
+    far, jitter = dr.opaque(mi.Float, t_max), dr.opaque(mi.Float, 0.5)
+    return Rays(origin, direction, far, jitter, mi.Bool(True))
+
+
+def as_rows(seen: March) -> np.ndarray:
+    rows = [*seen.radiance, seen.opacity, seen.moment]
+    return np.stack([np.array(row) for row in rows])
+
+
+def test_absorption_against_float64() -> None:
+    x = np.concatenate([[0.0], np.geomspace(1e-7, 50, 200)])
+    phi, slope = absorption(mi.Float(x.astype(np.float32)))
+    x = np.maximum(x.astype(np.float32).astype(np.float64), 1e-300)
+    expected = -np.expm1(-x) / x
+    np.testing.assert_allclose(phi.numpy(), expected, rtol=2e-6)
+    with np.errstate(all="ignore"):
+        exact = (np.exp(-x) * (x + 1) - 1) / x**2
+    exact = np.where(x < 1e-3, -0.5 + x / 3, exact)
+    np.testing.assert_allclose(slope.numpy(), exact, rtol=2e-5)
+
+
+def test_fields_apart_are_the_depth_composite(rng: np.random.Generator) -> None:
+    front, back = (
+        PosedField(small.blob(rng), Pose.upright((x, 0.0, 0.0), 0.0, 0.4))
+        for x in (-1.0, 1.0)
+    )
+    rays = make_rays(rng)
+    for fields in ([front, back], [back, front]):
+        exact = InterleavedComposite().render(fields, rays, 0.0).total
+        folded = DepthComposite().render(fields, rays, 0.0).total
+        assert exact.opacity.numpy().max() > 0.3
+        np.testing.assert_allclose(as_rows(exact), as_rows(folded), atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("move", "t_max"),
+    [((0, 0, 0), 0.0), ((-9, 0, 0), 10.0), ((0, 9, 0), 10.0)],
+    ids=["empty ray", "behind the camera", "beside"],
+)
+def test_nothing_is_seen(rng, move, t_max) -> None:
+    fields = [PosedField(small.blob(rng), Pose.upright(move, 0.0)) for _ in range(2)]
+    seen = InterleavedComposite().render(fields, make_rays(rng, t_max), 0.0).total
+    assert (as_rows(seen) == 0).all() and (seen.depth.numpy() == np.inf).all()
+
+
+def test_opaque_box_inside_fog(rng: np.random.Generator) -> None:
+    fog = PosedField(small.homogeneous(0.5, -1.0))
+    box = PosedField(small.homogeneous(1e5, 1.0), Pose.upright((0, 0, 0), 0.0, 0.3))
+    rays = make_rays(rng)
+    rays.origin, rays.direction = mi.Point3f(-3, 0.1, 0.1), mi.Vector3f(1, 0, 0)
+    seen = InterleavedComposite().render([fog, box], rays, 0.0)
+    passed = np.exp(-0.5 * 0.7)  # from x = -1 to x = -0.3
+    raw = small.sigmoid_to_linear(np.array([-1.0, 1.0]))
+    expected = (1 - passed) * raw[0] + passed * raw[1]
+    assert seen.total.opacity[0] == pytest.approx(1, abs=1e-6)
+    np.testing.assert_allclose(seen.total.radiance.numpy(), expected, rtol=2e-4)

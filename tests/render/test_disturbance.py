@@ -8,18 +8,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers.analytic_loop import row_type, tensor, tensor_type
-from helpers.derivatives import central_difference
-from helpers.kernels import nothing_compiled
 from scipy.ndimage import gaussian_filter
+from support.reference.derivatives import central_difference, nothing_compiled
+from support.reference.loop import row_type, tensor, tensor_type
 
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy, srgb_to_linear_numpy
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera.disturbance import (
-    Disturbance,
-    blur,
-    standard_normal,
-)
+from mi_nerfattack.render.camera.disturbance import Disturbance, blur, standard_normal
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -44,14 +39,9 @@ def test_blur_is_that_of_scipy(image, largest):
     found = np.array(blur(row_type()(image.ravel()), SHAPE, blurs)).reshape(SHAPE)
     # Dr.Jit keeps weights in single precision
     np.testing.assert_allclose(found, blurred(image, blurs), rtol=0, atol=3e-7)
-
-
-def test_blur_alone_is_that_in_a_batch(image):
-    blurs = np.array([0.7, 0.0, 2.3])
-    together = np.array(blur(row_type()(image.ravel()), SHAPE, blurs)).reshape(SHAPE)
-    for k in range(3):
+    for k in range(3):  # each image is blurred as in a batch
         alone = blur(row_type()(image[k].ravel()), (1, *SHAPE[1:]), blurs[k : k + 1])
-        assert np.array_equal(np.array(alone), together[k].ravel())
+        assert np.array_equal(np.array(alone), found[k].ravel())
 
 
 def test_light_is_blurred_and_exposed_and_values_get_noise(image):
@@ -123,21 +113,17 @@ def test_other_steps_and_sizes_compile_nothing():
         np.array(disturbance.vjp(given, step, given))
 
     work(ALL, 0)
-    with nothing_compiled():
-        work(replace(ALL, noise_sd=0.1, exposure_ev_sd=0.2), 5)
-
-
-def test_standard_deviations_of_one_reach_share_their_kernels():
-    value = mi.Float(dr.linspace(mi.Float, 0, 1, int(np.prod(SHAPE))))
-    dr.eval(value)
+    value = given.array
     np.array(blur(value, SHAPE, np.array([0.5, 1.0, 0.5])))
     with nothing_compiled():
-        np.array(blur(value, SHAPE, np.array([0.6, 1.1, 0.4])))
+        work(replace(ALL, noise_sd=0.1, exposure_ev_sd=0.2), 5)
+        np.array(blur(value, SHAPE, np.array([0.6, 1.1, 0.4])))  # of the same reach
 
 
 def test_nothing_is_disturbed_by_default_and_sizes_are_checked(image):
     assert not Disturbance(seed=3)
     found = np.array(Disturbance().apply(tensor_type()(image), 0))
     assert np.array_equal(found, image)
-    with pytest.raises(InputError, match="Disturbance.noise_sd: -0.1; must be"):
+    with pytest.raises(InputError) as caught:
         Disturbance(noise_sd=-0.1)
+    assert caught.value.where == "Disturbance.noise_sd"

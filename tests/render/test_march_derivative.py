@@ -1,22 +1,22 @@
-"""Derivatives of the march: central differences and the dot-product identity."""
+"""Derivatives through composites: central differences and the dot-product identity."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import small_fields as small
-from helpers.derivatives import central_difference
-from helpers.variants import later
+from support.files import objects as made
+from support.reference.derivatives import central_difference
+from support.worlds import fields as small
 
 from mi_nerfattack.fields import AbstractField, GridField, GridLayout, Occupancy
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.render.march import march, march_derivative
+from mi_nerfattack.render.composite import DepthComposite, Seen
+from mi_nerfattack.render.interleaved import InterleavedComposite
+from mi_nerfattack.render.march import march
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.rays import March
+from mi_nerfattack.render.splatting.background import SplatBackground
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -24,141 +24,146 @@ COUNT = 32
 POSE = Pose.upright((0.1, 0.0, 0.0), 0.3, 1.2)
 
 
-class Setting:
-    """A field under test, its rays and a random objective, linear in the march."""
+class Case:
+    """Layers or a field, rays, and a random objective, linear in what is seen."""
 
-    def __init__(
-        self, rng: np.random.Generator, field: AbstractField, inside: bool = False
-    ) -> None:
-        self.field = field
-        self.posed = PosedField(field, POSE)
-        self.origin, self.direction, _, _ = small.fan(rng, COUNT)
-        self.t_max = 10.0
-        if inside:
-            self.origin, self.t_max = self.origin + mi.Vector3f(2.5, 0, 0), 0.8
+    def __init__(self, rng, layers, composite=None, inside: bool = False) -> None:
+        is_field = isinstance(layers, AbstractField)
+        self.layers = [PosedField(layers, POSE)] if is_field else layers
+        self.composite = composite or DepthComposite()
+        origin, direction, _, _ = small.fan(rng, COUNT)
+        shift = mi.Vector3f(2.5 if inside else 0, 0, 0)
+        t_max = 0.8 if inside else 10.0
+        self.rays = small.arguments(self.layers[0], origin + shift, direction, t_max)[1]
         self.cotangent = small.random_march(rng, COUNT)
 
-    def attach(self) -> mi.Float:
-        """Make the grid's parameters a leaf, and return it."""
-        packed = mi.Float(self.field.packed)
-        dr.enable_grad(packed)
-        self.field.packed = packed
-        return packed
+    def objective(self) -> float:
+        seen = self.composite.render(self.layers, self.rays, 0.0)
+        return small.pairing(seen.total, self.cotangent)
 
-    def march(self, origin=None, direction=None) -> March:
-        o = self.origin if origin is None else origin
-        d = self.direction if direction is None else direction
-        return march(*small.arguments(self.posed, o, d, self.t_max), 0.0)
+    def backward(self) -> None:
+        seen = self.composite.render(self.layers, self.rays, 0.0)
+        cotangent = Seen(self.cotangent)
+        self.composite.backward(self.layers, self.rays, seen, cotangent, 0.0)
 
-    def objective(self, *rays) -> float:
-        return small.pairing(self.march(*rays), self.cotangent)
+    def forward(self) -> float:
+        seen = self.composite.render(self.layers, self.rays, 0.0)
+        found = self.composite.forward(self.layers, self.rays, seen, 0.0)
+        return small.pairing(found.total, self.cotangent)
 
-    def derivative(self, mode: dr.ADMode):
-        primal = self.march()
-        rays = (self.origin, self.direction)
-        fixed = small.arguments(self.posed, *rays, self.t_max)
-        with_rays = mode == dr.ADMode.Backward
-        result = march_derivative(mode, *fixed, primal, self.cotangent, 0.0, with_rays)
-        dr.eval(result)
-        return result
+    def gradients(self) -> list[np.ndarray]:
+        """Differentiate by the first field's parameters, by origin and direction."""
+        field = self.layers[0].field
+        is_grid = isinstance(field, GridField)
+        packed = mi.Float(field.packed if is_grid else 0)
+        if is_grid:
+            dr.enable_grad(packed)
+            field.packed = packed
+        seen = self.composite.render(self.layers, self.rays, 0.0)
+        given = self.layers, self.rays, seen, Seen(self.cotangent)
+        (by_rays,) = self.composite.backward_rays(*given, 0.0, [0])
+        found = [dr.grad(packed), by_rays.origin, by_rays.direction]
+        return [value.numpy().copy() for value in found]
 
 
 @pytest.fixture
-def blob(rng: np.random.Generator) -> Setting:
-    return Setting(rng, small.blob(rng))
+def blob(rng: np.random.Generator) -> Case:
+    return Case(rng, small.blob(rng))
 
 
-@pytest.fixture
-def ngp(rng: np.random.Generator) -> Setting:
-    return Setting(rng, small.small_ngp())
-
-
-def check_parameter(
-    setting: Setting,
-    read: Callable[[], mi.Float],
-    write: Callable[[mi.Float], None],
-    tangent: np.ndarray,
-    h: float,
-    tolerance: float,
-) -> None:
+def check_parameter(case: Case, k: int, name: str, tangent, h: float, rel: float):
     """Compare difference, forward and backward derivative along one tangent."""
-    kind = type(read())
-    base = np.array(read().numpy())
+    field = case.layers[k].field
+
+    def read() -> mi.Float:
+        return field.packed if name == "packed" else field.parameters()[name]
+
+    kind, base = type(read()), np.array(read().numpy())
+
+    def write(values: np.ndarray, attach: bool = False) -> None:
+        value = kind(values.astype(base.dtype))
+        if attach:
+            dr.enable_grad(value)
+        if name == "packed":
+            field.packed = value
+        else:
+            field.set_parameter(name, value)
 
     def shifted(s: float) -> float:
-        write(kind((base + s * tangent).astype(base.dtype)))
-        return setting.objective()
+        write(base + s * tangent)
+        return case.objective()
 
     expected = central_difference(shifted, h)
-    leaf = kind(base)
-    dr.enable_grad(leaf)
-    write(leaf)
-    setting.derivative(dr.ADMode.Backward)
+    write(base, attach=True)
+    case.backward()
     backward = float(np.dot(dr.grad(read()).numpy().astype(float), tangent))
-
-    leaf = kind(base)
-    dr.enable_grad(leaf)
-    write(leaf)
+    write(base, attach=True)
     dr.set_grad(read(), kind(tangent.astype(base.dtype)))
-    forward = small.pairing(setting.derivative(dr.ADMode.Forward)[0], setting.cotangent)
-    assert forward == pytest.approx(backward, rel=1e-3)  # dot-product identity
-    assert backward == pytest.approx(expected, rel=tolerance)
+    assert case.forward() == pytest.approx(backward, rel=1e-3)  # dot-product identity
+    assert backward == pytest.approx(expected, rel=rel)
 
 
-@pytest.mark.parametrize("others", [0, slice(1, 4)], ids=["texture", "density"])
-def test_packed_parameters_of_a_grid(blob: Setting, rng, others) -> None:
-    field = blob.field
-    tangent = rng.normal(size=(field.n_vertices, 4))
-    tangent[:, others] = 0
-
-    def write(value: mi.Float) -> None:
-        field.packed = value
-
-    check_parameter(blob, lambda: field.packed, write, tangent.ravel(), 2e-2, 5e-3)
+def overlapping(rng: np.random.Generator) -> list[PosedField]:
+    """Make two blobs of different scale, step and pose that overlap."""
+    place = Pose.upright((0.2, 0.1, 0.1), 0.4, 0.7)
+    one = PosedField(small.blob(rng, step_m=0.03))
+    return [one, PosedField(small.blob(rng, 3.0, 0.05), place)]
 
 
-@pytest.mark.parametrize("name", ["table", "colour_weights", *later("density_weights")])
-def test_parameters_of_an_ngp(ngp: Setting, rng, name: str) -> None:
-    field = ngp.field
+@pytest.mark.parametrize("k", [0, 1])
+@pytest.mark.parametrize("composite", [DepthComposite(), InterleavedComposite()])
+def test_packed_parameters_of_two_grids(rng, composite, k: int) -> None:
+    case = Case(rng, overlapping(rng), composite)
+    tangent = rng.normal(size=dr.width(case.layers[k].field.packed))
+    check_parameter(case, k, "packed", tangent, 2e-2, 1e-3)
 
-    def write(value: mi.Float) -> None:
-        field.set_parameter(name, value)
 
-    tangent = rng.normal(size=dr.width(field.parameters()[name]))
+def test_texture_between_splats(rng) -> None:
+    veil = made.splats([[-2, 0, 0], [-1.8, 0.1, 0.2]], [0.8, 0.1, 0.2], 0.5, 0.4)
+    splats = SplatBackground(made.wall(4)), SplatBackground(veil)
+    case = Case(rng, [*splats, PosedField(small.blob(rng))])
+    tangent = rng.normal(size=(case.layers[2].field.n_vertices, 4))
+    tangent[:, 0] = 0
+    check_parameter(case, 2, "packed", tangent.ravel(), 0.2, 2e-3)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "table",
+        "colour_weights",
+        pytest.param("density_weights", marks=pytest.mark.slow),
+    ],
+)
+def test_parameters_of_an_ngp(rng, name: str) -> None:
+    ngp = Case(rng, small.small_ngp())
+    tangent = rng.normal(size=dr.width(ngp.layers[0].field.parameters()[name]))
     # Rectified networks have kinks, which a difference of finite step crosses.
-    check_parameter(ngp, lambda: field.parameters()[name], write, tangent, 2e-3, 2e-2)
+    check_parameter(ngp, 0, name, tangent, 2e-3, 2e-2)
 
 
-def test_gradient_accumulates_over_passes(blob: Setting) -> None:
-    packed = blob.attach()
-    blob.derivative(dr.ADMode.Backward)
-    once = dr.grad(packed).numpy().copy()
-    blob.derivative(dr.ADMode.Backward)
-    np.testing.assert_allclose(dr.grad(packed), 2 * once, rtol=1e-3, atol=1e-6)
+def test_gradient_accumulates_over_passes(blob: Case) -> None:
+    once = blob.gradients()[0]
+    blob.backward()
+    twice = dr.grad(blob.layers[0].field.packed).numpy()
+    np.testing.assert_allclose(twice, 2 * once, rtol=1e-3, atol=1e-6)
 
 
-def check_rays(setting: Setting, rng, h: float, tolerance: float) -> None:
+def check_rays(case: Case, rng, h: float, tolerance: float) -> None:
     """Compare the derivatives by origin and direction with differences."""
-    by_rays = setting.derivative(dr.ADMode.Backward)[1]
-    d_origin, d_direction = by_rays.origin, by_rays.direction
+    _, *gradients = case.gradients()
     tangent = rng.normal(size=(3, COUNT)).astype(np.float32)
+    for name, gradient in zip(("origin", "direction"), gradients, strict=True):
+        before = getattr(case.rays, name)
 
-    def by_origin(s: float) -> float:
-        return setting.objective(setting.origin + s * mi.Vector3f(tangent))
+        def shifted(s: float, name=name, before=before) -> float:
+            setattr(case.rays, name, before + s * mi.Vector3f(tangent))
+            return case.objective()
 
-    def by_direction(s: float) -> float:
-        return setting.objective(None, setting.direction + s * mi.Vector3f(tangent))
-
-    for function, gradient in ((by_origin, d_origin), (by_direction, d_direction)):
-        found = float((gradient.numpy().astype(float) * tangent).sum())
-        expected = central_difference(function, h)
+        expected = central_difference(shifted, h)
+        setattr(case.rays, name, before)
+        found = float((gradient.astype(float) * tangent).sum())
         assert found == pytest.approx(expected, rel=tolerance, abs=1e-3)
-
-
-@pytest.mark.slow
-def test_origin_and_direction_through_a_blob(blob: Setting, rng) -> None:
-    # Samples that cross the faces of cells, kinks of the field, cost accuracy.
-    check_rays(blob, rng, 1e-3, 1.5e-2)
 
 
 def test_origin_and_direction_within_one_cell(rng: np.random.Generator) -> None:
@@ -166,7 +171,7 @@ def test_origin_and_direction_within_one_cell(rng: np.random.Generator) -> None:
     field = GridField(GridLayout(1, 2, 2), -small.ONES, small.ONES, step_m=0.05)
     noise = rng.normal(size=(field.n_vertices, 4)).astype(np.float32)
     field.packed = mi.Float(noise.ravel())
-    check_rays(Setting(rng, field, inside=True), rng, 1e-2, 1e-3)
+    check_rays(Case(rng, field, inside=True), rng, 1e-2, 1e-3)
 
 
 def test_direction_also_turns_the_view_of_an_ngp(rng: np.random.Generator) -> None:
@@ -174,12 +179,11 @@ def test_direction_also_turns_the_view_of_an_ngp(rng: np.random.Generator) -> No
     field = small.small_ngp()
     width = dr.width(field.parameters()["table"])
     field.set_parameter("table", mi.Float(np.full(width, 0.5, np.float32)))
-    setting = Setting(rng, field, inside=True)
-    by_rays = setting.derivative(dr.ADMode.Backward)[1]
-    d_origin, d_direction = by_rays.origin, by_rays.direction
-    assert np.abs(d_origin.numpy()).max() < 1e-4
-    assert np.abs(d_direction.numpy()).max() > 1e-2
-    check_rays(setting, rng, 2e-3, 2e-2)
+    case = Case(rng, field, inside=True)
+    _, by_origin, by_direction = case.gradients()
+    assert np.abs(by_origin).max() < 1e-4
+    assert np.abs(by_direction).max() > 1e-2
+    check_rays(case, rng, 2e-3, 2e-2)
 
 
 def test_skipped_cells_have_no_gradient(rng: np.random.Generator) -> None:
@@ -187,38 +191,27 @@ def test_skipped_cells_have_no_gradient(rng: np.random.Generator) -> None:
     cells = np.ones((4, 4, 4), bool)
     cells[:, :, 2:] = False  # z > 0
     field.occupy(Occupancy(cells))
-    setting = Setting(rng, field)
-    setting.posed = PosedField(field)
-    packed = setting.attach()
-    setting.derivative(dr.ADMode.Backward)
-    gradient = np.abs(dr.grad(packed).numpy().reshape(-1, 4)).max(1)
+    gradient = Case(rng, [PosedField(field)]).gradients()[0]
+    gradient = np.abs(gradient.reshape(-1, 4)).max(1)
     height = small.vertices(field)[:, 2]
     coarsest = 2 / (small.SMALL.base_resolution - 1)
     assert gradient[height < 0].max() > 1e-3
     assert gradient[height > coarsest + 1e-3].max() == 0
 
 
-def test_rays_that_miss_have_zero_gradient(blob: Setting) -> None:
-    blob.origin = blob.origin + mi.Vector3f(0, 50, 0)
-    packed = blob.attach()
-    by_rays = blob.derivative(dr.ADMode.Backward)[1]
-    d_origin, d_direction = by_rays.origin, by_rays.direction
-    for value in (dr.grad(packed), d_origin, d_direction):
-        assert (value.numpy() == 0).all()
+def test_rays_that_miss_have_zero_gradient(blob: Case) -> None:
+    blob.rays.origin += mi.Vector3f(0, 50, 0)
+    assert not any(value.any() for value in blob.gradients())
 
 
 @pytest.mark.parametrize("density", [1e-6, 1e4])
 def test_gradient_is_finite_near_opacity_0_and_1(rng, density: float) -> None:
-    setting = Setting(rng, small.homogeneous(density))
-    packed = setting.attach()
-    by_rays = setting.derivative(dr.ADMode.Backward)[1]
-    d_origin, d_direction = by_rays.origin, by_rays.direction
-    for value in (dr.grad(packed), d_origin, d_direction):
-        assert np.isfinite(value.numpy()).all()
-    assert np.abs(dr.grad(packed).numpy()).max() > 0
+    found = Case(rng, small.homogeneous(density)).gradients()
+    assert all(np.isfinite(value).all() for value in found)
+    assert np.abs(found[0]).max() > 0
 
 
-def test_march_itself_records_nothing(blob: Setting) -> None:
-    blob.attach()
-    seen = blob.march()
+def test_march_itself_records_nothing(blob: Case) -> None:
+    dr.enable_grad(blob.layers[0].field.packed)
+    seen = march(blob.layers[0], blob.rays, 0.0)
     assert not dr.grad_enabled(seen.radiance, seen.opacity, seen.moment)

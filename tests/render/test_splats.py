@@ -3,18 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import splat_files as made
 from scipy.spatial.transform import Rotation
+from support.files import objects as made
+from support.reference.derivatives import central_difference, nothing_compiled
+from support.worlds import fields as small
+from support.worlds import loops as toy
+from support.worlds.loops import along_texture, make_rollout, texture_gradient, unit
 
 from mi_nerfattack.backend.colour import srgb_to_linear_numpy
+from mi_nerfattack.deploy.surrogate.scene import field_sensor
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.splats import Splats
 from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.composite import DepthComposite, Seen
+from mi_nerfattack.render.interleaved import InterleavedComposite
+from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
-from mi_nerfattack.render.splats import SplatBackground
+from mi_nerfattack.render.splatting.background import SplatBackground
+from mi_nerfattack.rollout.function import Rollout
+from mi_nerfattack.rollout.objective import StageSum
+from mi_nerfattack.vehicle.dynamics import to_state
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -66,34 +80,17 @@ def test_one_gaussian_has_the_closed_form(distance: float) -> None:
     np.testing.assert_allclose(seen.depth.numpy(), depth, rtol=1e-5)
 
 
-def test_an_oblique_ray_peaks_where_the_distance_is_least(rng) -> None:
-    turn = Rotation.random(random_state=3)
-    item = made.splats([3, 0.1, -0.2], RED, 0.5, [0.5, 0.2, 0.05])
-    item = replace(item, quaternions=turn.as_quat()[None, [3, 0, 1, 2]])
-    direction = np.array([1, 0.05, -0.06]) / np.linalg.norm([1, 0.05, -0.06])
-    t = np.linspace(0, 6, 600001)
-    offset = t[:, None] * direction - item.centers[0]
-    squared = ((offset @ turn.as_matrix() / [0.5, 0.2, 0.05]) ** 2).sum(1)
-    best = squared.argmin()
-    seen = look(item, directions=direction)
-    assert float(seen.depth[0]) == pytest.approx(t[best], abs=2e-5)
-    assert float(seen.opacity[0]) == pytest.approx(
-        0.5 * np.exp(-squared[best] / 2), rel=1e-4
-    )
-
-
-@pytest.mark.parametrize("near", [0, 1])
-def test_two_along_a_ray_blend_in_srgb_front_to_back(near: int) -> None:
-    places = [[2.0, 0, 0], [5.0, 0, 0]]
-    item = made.splats(places if near == 0 else places[::-1], [RED, BLUE], [0.6, 0.3])
-    colours, alphas = [RED, BLUE], [0.6, 0.3]
-    front, back = (0, 1) if near == 0 else (1, 0)
-    first, second = alphas[front], (1 - alphas[front]) * alphas[back]
-    display = first * colours[front] + second * colours[back]
-    seen = look(item)
+@pytest.mark.parametrize(
+    ("far", "size"), [(5.0, 0.1), (9.0, 2.5)], ids=["small", "its shell begins first"]
+)
+@pytest.mark.parametrize("order", [1, -1])
+def test_two_along_a_ray_blend_in_srgb_front_to_back(far, size, order: int) -> None:
+    rows = [([2.0, 0, 0], RED, 0.6, 0.1), ([far, 0, 0], BLUE, 0.3, size)][::order]
+    seen = look(made.splats(*map(list, zip(*rows, strict=True))))
+    first, second = 0.6, 0.4 * 0.3
     assert float(seen.opacity[0]) == pytest.approx(first + second, rel=1e-5)
-    assert float(seen.moment[0]) == pytest.approx(2 * first + 5 * second, rel=1e-5)
-    expected = linear(display, np.array(first + second))
+    assert float(seen.moment[0]) == pytest.approx(2 * first + far * second, rel=1e-5)
+    expected = linear(first * RED + second * BLUE, np.array(first + second))
     np.testing.assert_allclose(seen.radiance.numpy()[:, 0], expected, rtol=1e-5)
 
 
@@ -136,101 +133,259 @@ def test_small_and_thin_splats_far_away_are_not_missed(rng) -> None:
         assert error.max() < 0.02
 
 
-def test_the_order_in_the_file_does_not_matter(rng) -> None:
-    item, directions = made.cloud(rng, 300), sphere(rng, 100)
-    order = rng.permutation(item.count)
-    arrays = ("centers", "scales", "quaternions", "opacities", "harmonics")
-    mixed = replace(item, **{name: getattr(item, name)[order] for name in arrays})
-    a, b = (look(x, directions=directions).radiance.numpy() for x in (item, mixed))
-    np.testing.assert_allclose(a, b, atol=1e-6)
+@pytest.mark.parametrize("count", [3, 90])
+def test_rays_may_come_from_many_origins(rng, count: int) -> None:
+    """Vehicles side by side, or places in the aperture of a lens."""
+    item = made.cloud(rng, 300)
+    origins = rng.uniform(-0.4, 0.4, (count, 3)).astype(np.float32) + [-6, 0, 0]
+    aims = np.array([3, 0, 0]) + rng.normal(0, 0.4, (count, 40, 3))
+    aims = (aims / np.linalg.norm(aims, axis=2)[..., None]).astype(np.float32)
+    seen = look(item, np.repeat(origins, 40, 0), aims.reshape(-1, 3))
+    found = seen.opacity.numpy().reshape(count, 40), seen.moment.numpy()
+    for k, (origin, directions) in enumerate(zip(origins, aims, strict=True)):
+        _, opacity, moment = made.reference(item, origin, directions)
+        np.testing.assert_allclose(found[0][k], opacity, atol=1e-5)
+        np.testing.assert_allclose(found[1].reshape(count, 40)[k], moment, atol=2e-4)
 
 
-def test_splats_at_one_place_all_count() -> None:
-    seen = look(made.splats([[2, 0, 0]] * 5, RED, 0.3))
-    assert float(seen.opacity[0]) == pytest.approx(1 - 0.7**5, rel=1e-5)
-
-
-def test_a_large_splat_comes_behind_what_it_begins_in_front_of() -> None:
-    item = made.splats([[3, 0, 0], [9, 0, 0]], [RED, BLUE], 0.5, [0.1, 2.5])
-    first, second = 0.5, 0.25
-    expected = linear(first * RED + second * BLUE, np.array(0.75))
-    seen = look(item)  # the shell of the second one begins at 1.5
-    np.testing.assert_allclose(seen.radiance.numpy()[:, 0], expected, rtol=1e-5)
-
-
-def test_an_opaque_wall_is_a_coloured_wall() -> None:
-    origins = np.random.default_rng(1).uniform(-0.6, 0.6, (50, 3)) * [0, 1, 1]
-    seen = look(made.wall(4, RED, half=1, step=0.1), origins, stop=1e-3)
-    np.testing.assert_allclose(seen.opacity.numpy(), 1, atol=2e-3)
-    expected = np.tile(srgb_to_linear_numpy(RED), (50, 1))
-    np.testing.assert_allclose(seen.radiance.numpy().T, expected, atol=2e-3)
-    np.testing.assert_allclose(seen.depth.numpy(), 4, rtol=1e-4)
-
-
-def test_rays_end_where_little_is_passed() -> None:
-    item = made.splats([[2, 0, 0], [3, 0, 0], [4, 0, 0]], RED, 0.9)
+def test_rays_end_where_little_is_passed_or_nothing_is_met() -> None:
+    item = made.splats([[2, 0, 0], [2, 0, 0], [4, 0, 0]], RED, 0.9)
     assert float(look(item, stop=0.05).opacity[0]) == pytest.approx(0.99, rel=1e-5)
     assert float(look(item).opacity[0]) == pytest.approx(0.999, rel=1e-5)
-
-
-def test_rays_that_meet_nothing_and_inactive_rays_are_empty() -> None:
-    item = made.splats([-2, 0, 0], RED)
-    seen = look(item, directions=[[1, 0, 0], [0, 1, 0]])
+    seen = look(item, directions=[[-1, 0, 0], [0, 1, 0]])
     assert not seen.opacity.numpy().any() and not seen.radiance.numpy().any()
     assert np.isinf(seen.depth.numpy()).all()
-    rays = Rays(mi.Point3f(0), mi.Vector3f(-1, 0, 0), active=mi.Bool(False))
+    rays = Rays(mi.Point3f(0), mi.Vector3f(1, 0, 0), active=mi.Bool(False))
     assert float(SplatBackground(item).march(rays, 0.0).opacity[0]) == 0
 
 
 # Colour and pose
 
 
-def test_degree_one_turns_colour_with_the_view() -> None:
-    """Colours by hand: C1 (-y a + z b - x c), C1 = sqrt(3 / (4 pi))."""
-    rest = np.zeros((1, 3, 3))
-    rest[0, :, 0] = 0.1, 0.2, 0.3
-    item = made.splats([0, 0, 0], (0.5, 0.4, 0.3), 0.5, rest=rest)
-    direction = np.array([0.6, 0.0, 0.8])
-    seen = look(item, -2 * direction, direction)
-    red = 0.5 + np.sqrt(3 / (4 * np.pi)) * (0.2 * 0.8 - 0.3 * 0.6)
-    expected = 0.5 * srgb_to_linear_numpy(np.array([red, 0.4, 0.3]))
-    np.testing.assert_allclose(seen.radiance.numpy()[:, 0], expected, rtol=1e-5)
-
-
-@pytest.mark.parametrize("degree", [2, 3])
-def test_higher_degrees_are_orthonormal_to_the_lower(rng, degree: int) -> None:
-    """The last harmonic of each degree by its polynomial."""
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_colour_turns_with_the_view(rng, degree: int) -> None:
+    """By the polynomials of degree 1 and of the last harmonic of the others."""
     rest = np.zeros((1, (degree + 1) ** 2 - 1, 3))
     rest[0, -1, 1] = 0.3
-    item = made.splats([0, 0, 0], (0.5, 0.5, 0.5), 0.5, rest=rest)
     x, y, z = direction = sphere(rng, 1)[0].astype(float)
     value = {
-        2: np.sqrt(15 / (16 * np.pi)) * (x * x - y * y),
-        3: -np.sqrt(35 / (32 * np.pi)) * x * (x * x - 3 * y * y),
+        1: 0.3 * -x,
+        2: 0.3 * np.sqrt(15 / (16 * np.pi)) * (x * x - y * y),
+        3: 0.3 * -np.sqrt(35 / (32 * np.pi)) * x * (x * x - 3 * y * y),
     }[degree]
+    if degree == 1:
+        rest[0, :2, 1] = 0.1, 0.2
+        value = np.sqrt(3 / (4 * np.pi)) * (value - 0.1 * y + 0.2 * z)
+    item = made.splats([0, 0, 0], (0.5, 0.4, 0.3), 0.5, rest=rest)
     seen = look(item, -2 * direction, direction)
-    expected = 0.5 * srgb_to_linear_numpy(np.array([0.5, 0.5 + 0.3 * value, 0.5]))
+    expected = 0.5 * srgb_to_linear_numpy(np.array([0.5, 0.4 + value, 0.3]))
     np.testing.assert_allclose(seen.radiance.numpy()[:, 0], expected, rtol=1e-5)
 
 
 def test_a_pose_moves_splats_with_their_views(rng) -> None:
     item = made.cloud(rng, 100)
-    item = replace(
-        item,
-        harmonics=np.concatenate(
-            [item.harmonics, rng.normal(0, 0.2, (100, 3, 3)).astype(np.float32)], 1
-        ),
-    )
+    of_views = rng.normal(0, 0.2, (100, 3, 3)).astype(np.float32)
+    item = replace(item, harmonics=np.concatenate([item.harmonics, of_views], 1))
     turn, move, scale = Rotation.random(random_state=1), np.array([1.0, -2, 3]), 2.5
     pose = Pose(turn.as_matrix(), move, scale)
     origin, directions = np.array([0.2, 0.1, 0.0]), sphere(rng, 80)
     still = look(item, origin, directions)
-    moved = look(
-        item, scale * turn.apply(origin) + move, turn.apply(directions), pose=pose
-    )
-    np.testing.assert_allclose(
-        moved.radiance.numpy(), still.radiance.numpy(), atol=2e-4
-    )
-    np.testing.assert_allclose(
-        moved.moment.numpy(), scale * still.moment.numpy(), rtol=1e-3, atol=1e-3
-    )
+    turned = scale * turn.apply(origin) + move, turn.apply(directions)
+    moved = look(item, *turned, pose=pose)
+    pair = moved.radiance.numpy(), still.radiance.numpy()
+    np.testing.assert_allclose(*pair, atol=2e-4)
+    pair = moved.moment.numpy(), scale * still.moment.numpy()
+    np.testing.assert_allclose(*pair, rtol=1e-3, atol=1e-3)
+
+
+# Among fields
+
+
+@pytest.mark.parametrize("x", [2, 9])
+def test_a_splat_hides_and_is_hidden_by_depth(x: float) -> None:
+    """A splat before or behind a cube of edge 2 at x = 5."""
+    cube = PosedField(small.homogeneous(0.7, 0.3), Pose.upright((5, 0, 0), 0.0))
+    rays = Rays(mi.Point3f(0, 0, 0), mi.Vector3f(1, 0, 0))
+    dr.make_opaque(rays)
+    layers = [SplatBackground(made.splats([x, 0, 0], RED, 0.6)), cube]
+    seen = DepthComposite().render(layers, rays, 0.0)
+    splat = 0.6, srgb_to_linear_numpy(RED), x
+    grey = np.full(3, small.sigmoid_to_linear(np.array(0.3)))
+    slab = 1 - np.exp(-1.4), grey, float(seen.layers[1].depth[0])
+    (a, front, near), (b, back, far) = (splat, slab) if x < 5 else (slab, splat)
+    expected = a * front + (1 - a) * b * back
+    np.testing.assert_allclose(seen.total.radiance.numpy()[:, 0], expected, rtol=2e-4)
+    assert float(seen.total.opacity[0]) == pytest.approx(a + (1 - a) * b, rel=2e-4)
+    moment = a * near + (1 - a) * b * far
+    assert float(seen.total.moment[0]) == pytest.approx(moment, rel=2e-4)
+
+
+def test_bricks_have_no_derivatives_by_rays(rng) -> None:
+    back, front = PosedField(small.small_bricks(rng)), PosedField(small.blob(rng))
+    layers, composite = [back, front], DepthComposite()
+    rays = Rays(*small.fan(rng)[:2])
+    seen = composite.render(layers, rays, 0.0)
+    cotangent = Seen(small.random_march(rng, dr.width(rays.direction)))
+    with pytest.raises(InputError, match="keep the camera detached") as caught:
+        composite.backward_rays(layers, rays, seen, cotangent, 0.0, [0, 1])
+    assert caught.value.where == "brick_field"
+    # the objects among them have such derivatives, which poses are attacked by
+    (found,) = composite.backward_rays(layers, rays, seen, cotangent, 0.0, [1])
+    by_origin = found.origin.numpy()
+    assert np.isfinite(by_origin).all() and by_origin.any()
+
+
+# Derivatives
+
+
+class Derived:
+    """A cloud of 60 splats, its rays, and the derivatives of a random objective."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.item, n = made.cloud(rng, 60), 200
+        aims = np.array([3, 0, 0]) + rng.normal(0, 0.3, (n, 3))
+        aims /= np.linalg.norm(aims, axis=1)[:, None]
+        self.origin, self.directions = np.array([-6, 0.1, 0.2]), aims.astype(np.float32)
+        self.rays = Rays(mi.Point3f(self.origin), mi.Vector3f(self.directions.T))
+        self.cotangent = small.random_march(rng, n)
+        self.splats = SplatBackground(self.item)
+        self.seen = self.splats.march(self.rays, 0.0)
+        self.values = {"harmonics": self.splats.harmonics, "opacity": None}
+        self.values["opacity"] = self.splats.opacity
+        dr.enable_grad(self.splats.harmonics, self.splats.opacity)
+
+    def derive(self, mode: dr.ADMode, cotangent: March) -> Any:
+        args = self.rays, self.seen, cotangent, 0.0, mode == dr.ADMode.Backward
+        return self.splats.derivative(mode, *args)
+
+    def expected(self, origin=0.0, directions=0.0, **changes: Any) -> np.ndarray:
+        """Return the objective in float64, ray by ray."""
+        item = replace(self.item, **changes)
+        where = self.origin + origin, self.directions + directions
+        display, opacity, moment = made.reference(item, *where)
+        by = [self.cotangent.radiance.numpy().T.astype(float)]
+        by += [
+            x.numpy().astype(float)
+            for x in (self.cotangent.opacity, self.cotangent.moment)
+        ]
+        colour = (linear(display, opacity) * by[0]).sum(1)
+        return colour + opacity * by[1] + moment * by[2]
+
+
+@pytest.fixture
+def derived(rng) -> Derived:
+    return Derived(rng)
+
+
+def agree(found: np.ndarray, expected: np.ndarray) -> None:
+    assert np.linalg.norm(found - expected) < 1e-4 * np.linalg.norm(expected)
+
+
+STEP = 1e-6  # of differences in float64
+
+
+@pytest.mark.parametrize("name", ["harmonics", "opacity"])
+def test_derivatives_by_shades_are_those_of_the_float64_sum(derived, name) -> None:
+    derived.derive(dr.ADMode.Backward, derived.cotangent)
+    found = dr.grad(derived.values[name]).numpy()
+    key = {"opacity": "opacities"}.get(name, name)
+    values = getattr(derived.item, key).astype(float)
+    expected = []
+    for k in range(values.size):
+        pair = []
+        for step in (STEP, -STEP):
+            changed = values.copy()
+            changed.flat[k] += step
+            pair.append(derived.expected(**{key: changed}).sum())
+        expected.append((pair[0] - pair[1]) / (2 * STEP))
+    agree(found, np.array(expected))
+
+
+@pytest.mark.parametrize("name", ["origin", "direction"])
+def test_derivatives_by_rays_are_those_of_the_float64_sum(derived, name) -> None:
+    _, by_rays = derived.derive(dr.ADMode.Backward, derived.cotangent)
+    found = getattr(by_rays, name).numpy()
+    key = {"direction": "directions"}.get(name, name)
+    for axis in range(3):
+        step = STEP * np.eye(3)[axis]
+        pair = [derived.expected(**{key: sign * step}) for sign in (1, -1)]
+        agree(found[axis], (pair[0] - pair[1]) / (2 * STEP))
+
+
+def test_tangents_are_the_transpose(derived, rng) -> None:
+    derived.derive(dr.ADMode.Backward, derived.cotangent)
+    expected = 0.0
+    for value in derived.values.values():
+        tangent = rng.normal(size=dr.width(value)).astype(np.float32)
+        expected += float(tangent.astype(float) @ dr.grad(value).numpy())
+        dr.set_grad(value, mi.Float(tangent))
+    tangent, _ = derived.derive(dr.ADMode.Forward, March())
+    assert small.pairing(tangent, derived.cotangent) == pytest.approx(expected, 1e-4)
+
+
+def test_colours_that_change_with_the_view_move_with_the_origin(rng) -> None:
+    rest = rng.normal(0, 0.2, (4, 3, 3))
+    centers = [[8, 0.3, 0.1], [10, -0.2, 0.2], [12, 0, -0.3], [14, 0.1, 0]]
+    item = SplatBackground(made.splats(centers, 0.5, 0.5, 3.0, rest=rest))
+    aims = [[10, y, z] for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
+    directions = np.array(aims) / np.linalg.norm(aims, axis=1)[:, None]
+    cotangent = small.random_march(rng, 4)
+
+    def rays(x: np.ndarray) -> Rays:
+        return Rays(mi.Point3f(x), mi.Vector3f(directions.T.astype(np.float32)))
+
+    seen = item.march(rays(np.zeros(3)), 0.0)
+    args = rays(np.zeros(3)), seen, cotangent, 0.0, True
+    _, found = item.derivative(dr.ADMode.Backward, *args)
+    for axis in range(3):
+        step = 0.02 * np.eye(3)[axis]
+        pair = [item.march(rays(sign * step), 0.0) for sign in (1, -1)]
+        expected = small.pairing(pair[0], cotangent) - small.pairing(pair[1], cotangent)
+        by_origin = float(dr.sum(found.origin[axis])[0])
+        assert by_origin == pytest.approx(25 * expected, rel=5e-3, abs=1e-3)
+
+
+@pytest.fixture
+def loop() -> Any:
+    """The toy loop among splats."""
+    loop, _ = toy.make_loop()
+    rng = np.random.default_rng(3)
+    places = rng.uniform([2, -6, 0], [20, 6, 4], (200, 3))
+    street = made.splats(places, rng.random((200, 3)), 0.5, rng.uniform(0.1, 0.8, 200))
+    old = loop.sensor
+    view = old.intrinsics, old.mount
+    sensor = field_sensor(SplatBackground(street), old.objects, *view, stop=0.0)
+    return replace(loop, sensor=sensor)
+
+
+def test_nothing_is_compiled_after_the_first_steps(loop) -> None:
+    start = np.array([[0.0, 0.35, 0.02]])
+    rollout = Rollout(loop, StageSum(toy.square_error), 3)
+    rollout.gradient(rollout.run(to_state(start)))
+    with nothing_compiled():
+        rollout.gradient(rollout.run(to_state(start + 0.07)))
+
+
+def test_a_gradient_goes_through_a_camera_among_splats(loop) -> None:
+    """Steering turns what the next frame shows, splats too; held cameras miss that."""
+    (posed,) = loop.sensor.objects
+    rollout = make_rollout(loop, 10, attached=True)
+    found = texture_gradient(rollout)
+    direction = unit(found)
+    expected = central_difference(along_texture(rollout, posed.field, direction), 0.2)
+    assert float((found * direction).sum()) == pytest.approx(expected, rel=0.01)
+    held = texture_gradient(make_rollout(loop, 10))
+    assert float((held * direction).sum()) != pytest.approx(expected, rel=0.03)
+
+
+def test_splats_are_not_interleaved(loop) -> None:
+    sensor, composite = loop.sensor, InterleavedComposite()
+    rays = Rays(mi.Point3f(0, 0, 0), mi.Vector3f(1, 0, 0))
+    parts = sensor.layers[:1], sensor.objects, sensor.intrinsics
+    for call in (
+        lambda: composite.check(sensor.layers),
+        lambda: composite.render(sensor.layers, rays, 0.0),
+        lambda: field_sensor(*parts, composite="interleaved"),
+    ):
+        with pytest.raises(InputError, match="set composite to depth"):
+            call()

@@ -9,9 +9,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import torch
-from helpers import analytic_loop as analytic
-from helpers.derivatives import central_difference
-from helpers.rollouts import (
+from support.reference import loop as analytic
+from support.reference.derivatives import central_difference
+from support.worlds.loops import (
     ADJOINTS,
     Wave,
     assert_close,
@@ -25,10 +25,10 @@ from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.rollout.adjoint import Checkpointed
 from mi_nerfattack.rollout.function import Rollout
-from mi_nerfattack.rollout.reduction import Worst
+from mi_nerfattack.rollout.objective import Worst
 from mi_nerfattack.rollout.sensor import Observation
 from mi_nerfattack.rollout.sweep import StepRecorder
-from mi_nerfattack.vehicle.state import state_type, to_state
+from mi_nerfattack.vehicle.dynamics import state_type, to_state
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -96,8 +96,6 @@ def test_derivatives_by_images_go_through_a_memory():
 
 
 class StackPolicy(torch.nn.Module):
-    """Looks at three frames one after the other."""
-
     goals = 3
 
     def __init__(self):
@@ -107,6 +105,17 @@ class StackPolicy(torch.nn.Module):
     def forward(self, image, goal):
         parts = image.split(3, dim=1)
         return sum(w * self.network(x, goal) for w, x in zip(GAINS, parts, strict=True))
+
+
+def check(loop, twin, initial, horizon, reduce=torch.mean, tolerance=1e-8, **options):
+    """Compare value and gradient of a rollout with autograd through the twin."""
+    rollout = Rollout(loop, Wave(), horizon, **options)
+    evaluation = rollout.run(to_state(initial))
+    attached = options.get("attached", False)
+    value, expected = expected_gradient(loop, twin, initial, horizon, attached, reduce)
+    assert evaluation.value == pytest.approx(value, rel=1e-12)
+    assert_close(flat(rollout.gradient(evaluation)), expected, tolerance)
+    return evaluation
 
 
 @pytest.mark.parametrize("name", ADJOINTS)
@@ -126,12 +135,8 @@ def test_adjoints_are_autograd(
     loop, twin = analytic.make_pair(vehicle, integrator, substeps, delay, 2)
     loop.sensor.set_parameters({"offsets": OFFSETS})
     initial = loop.dynamics.extend(analytic.random_poses(3))
-    rollout = Rollout(loop, Wave(), horizon, adjoint=ADJOINTS[name], attached=attached)
-    evaluation = rollout.run(to_state(initial))
-    found = rollout.gradient(evaluation)
-    value, expected = expected_gradient(loop, twin, initial, horizon, attached)
-    assert evaluation.value == pytest.approx(value, rel=1e-12)
-    assert_close(flat(found), expected)
+    options = {"adjoint": ADJOINTS[name], "attached": attached}
+    check(loop, twin, initial, horizon, **options)
 
 
 class Rounded(torch.nn.Module):
@@ -151,13 +156,8 @@ def test_images_of_eight_bits_are_differentiated_straight_through(name):
     exact, twin = analytic.make_pair()
     loop, twin.module = replace(exact, eight_bit=True), Rounded(twin.module)
     initial = loop.dynamics.extend(analytic.random_poses(3))
-    rollout = Rollout(loop, Wave(), 7, adjoint=ADJOINTS[name], attached=True)
-    evaluation = rollout.run(to_state(initial))
-    found = rollout.gradient(evaluation)
-    value, expected = expected_gradient(loop, twin, initial, 7, True)
-    assert evaluation.value == pytest.approx(value, rel=1e-12)
-    assert_close(flat(found), expected)
-    unrounded = replace(rollout, loop=exact).run(to_state(initial)).value
+    value = check(loop, twin, initial, 7, adjoint=ADJOINTS[name], attached=True).value
+    unrounded = Rollout(exact, Wave(), 7).run(to_state(initial)).value
     assert abs(value - unrounded) > 1e-5  # the rounding is seen
 
 
@@ -191,11 +191,7 @@ def test_images_of_eight_bits_are_those_of_files():
 
 def test_a_hundred_periods():
     loop, twin = analytic.make_pair("ackermann", "rk4", 1, 2)
-    initial = analytic.random_poses(2)
-    rollout = Rollout(loop, Wave(), 100, attached=True)
-    found = rollout.gradient(rollout.run(to_state(initial)))
-    _, expected = expected_gradient(loop, twin, initial, 100, True)
-    assert_close(flat(found), expected, 1e-7)
+    check(loop, twin, analytic.random_poses(2), 100, tolerance=1e-7, attached=True)
 
 
 def test_costates_are_minus_the_derivative_by_the_states():
@@ -212,14 +208,9 @@ def test_costates_are_minus_the_derivative_by_the_states():
 
 def test_the_worst_drive_alone_is_differentiated():
     loop, twin = analytic.make_pair()
-    initial = analytic.random_poses(4)
-    rollout = Rollout(loop, Wave(), 5, reduction=Worst())
-    evaluation = rollout.run(to_state(initial))
-    found = flat(rollout.gradient(evaluation))
-    value, expected = expected_gradient(loop, twin, initial, 5, False, torch.max)
-    assert evaluation.value == pytest.approx(value, rel=1e-12)
+    poses = analytic.random_poses(4)
+    evaluation = check(loop, twin, poses, 5, torch.max, reduction=Worst())
     assert evaluation.costs.shape == (4,)
-    assert_close(found, expected)
 
 
 def test_dr_backward_differentiates_the_function(rng):
@@ -239,59 +230,29 @@ def test_dr_backward_differentiates_the_function(rng):
     assert_close([value / 3 for value in found], expected)
 
 
-def from_torch(rollout):
-    """The function of textures, initial states (n, 3) and offsets, for torch."""
-
-    @dr.wrap(source="torch", target="drjit")
-    def function(textures, initial, offsets):
-        return rollout(named(textures, offsets), state_type()(initial))
-
-    return lambda textures, initial, offsets: function(textures, initial.T, offsets)
-
-
 def named(textures, offsets):
-    """Name the parameters of the sensor."""
     return {f"texture{i}": t for i, t in enumerate(textures)} | {"offsets": offsets}
 
 
-def test_the_function_remembers_where_the_objects_stood():
+def test_torch_differentiates_the_function():
+    """Of the textures and offsets that it was given, whatever the sensor has later."""
     loop, twin = analytic.make_pair(objects=2)
     loop.sensor.set_parameters({"offsets": OFFSETS})
     initial = analytic.random_poses(2)
-    _, expected = expected_gradient(loop, twin, initial, 4, True)
-    rollout = Rollout(loop, Wave(), 4, attached=True)
-    leaves = [
-        torch.tensor(t.numpy(), requires_grad=True) for t in loop.sensor.textures()
-    ]
-    in_torch = from_torch(rollout)(leaves, torch.tensor(initial), torch.tensor(OFFSETS))
-    textures = loop.sensor.textures()
-    dr.enable_grad(textures)
-    value = rollout(named(textures, analytic.tensor(OFFSETS)), to_state(initial))
-    loop.sensor.set_parameters({"offsets": 0 * OFFSETS})  # another's use
-    dr.backward(value)
-    assert_close([dr.grad(texture).numpy() for texture in textures], expected[:2])
-    loop.sensor.set_parameters({"offsets": 0 * OFFSETS})
-    in_torch.backward()
-    assert_close([leaf.grad.numpy() for leaf in leaves], expected[:2])
-
-
-def test_torch_differentiates_the_function():
-    loop, twin = analytic.make_pair()
-    initial = analytic.random_poses(2)
     value, expected = expected_gradient(loop, twin, initial, 4, True)
-    texture, start, offsets = (
-        torch.tensor(value, requires_grad=True)
-        for value in (
-            loop.sensor.textures()[0].numpy(),
-            initial,
-            loop.sensor.offsets.numpy(),
-        )
-    )
     rollout = Rollout(loop, Wave(), 4, attached=True)
-    found = from_torch(rollout)([texture], start, offsets)
-    (2 * found).backward()
+
+    @dr.wrap(source="torch", target="drjit")
+    def function(textures, start, offsets):
+        return rollout(named(textures, offsets), state_type()(start))
+
+    values = [t.numpy() for t in loop.sensor.textures()] + [initial, OFFSETS]
+    leaves = [torch.tensor(value, requires_grad=True) for value in values]
+    *textures, start, offsets = leaves
+    found = function(textures, start.T, offsets)
     assert found.item() == pytest.approx(value, rel=1e-12)
-    leaves = texture, start, offsets
+    loop.sensor.set_parameters({"offsets": 0 * OFFSETS})  # another's use
+    (2 * found).backward()
     assert_close([leaf.grad.numpy() / 2 for leaf in leaves], expected)
 
 
@@ -311,10 +272,8 @@ def test_the_gradient_comes_apart_by_periods(rng):
         norms = [np.linalg.norm(row) for row in rows]
         np.testing.assert_allclose(norms, parts.norms[index], rtol=1e-6)
     assert sorted(periods) == list(range(6))
-    whole = [
-        (gradient.numpy() * direction).sum()
-        for gradient, direction in zip(found.textures, directions, strict=True)
-    ]
+    pairs = zip(found.textures, directions, strict=True)
+    whole = [(gradient.numpy() * direction).sum() for gradient, direction in pairs]
     np.testing.assert_allclose(parts.along.sum(0), whole, rtol=1e-5)
 
 
@@ -329,15 +288,16 @@ def test_what_cannot_be_differentiated_is_refused():
     rollout = Rollout(blind, Wave(), 2)
     with pytest.raises(TypeError, match="Blind: a black box has no derivatives"):
         rollout.gradient(rollout.run(initial))
-    with pytest.raises(ValueError, match="segment: 0"):
-        Checkpointed(0)
-    with pytest.raises(ValueError, match="delay: -1"):
-        replace(loop, delay=-1)
-    with pytest.raises(ValueError, match="substeps: 0"):
-        replace(loop, substeps=0)
+    for make, message in (
+        (lambda: Checkpointed(0), "segment: 0"),
+        (lambda: replace(loop, delay=-1), "delay: -1"),
+        (lambda: replace(loop, substeps=0), "substeps: 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make()
 
 
 def test_a_state_of_the_wrong_size_is_refused():
     loop, _ = analytic.make_pair("ackermann_rate")
-    with pytest.raises(ValueError, match=r"3 rows; RateLimitedAckermann has 4"):
+    with pytest.raises(ValueError, match="3 rows; .* 4"):
         Rollout(loop, Wave(), 2).run(to_state(analytic.random_poses(1)))

@@ -9,10 +9,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import toy_loop as toy
-from helpers.derivatives import central_difference
-from helpers.kernels import nothing_compiled
-from helpers.rollouts import (
+from support.reference.derivatives import central_difference, nothing_compiled
+from support.worlds import loops as toy
+from support.worlds.loops import (
     ADJOINTS,
     INITIAL,
     OFFSET,
@@ -26,14 +25,14 @@ from helpers.rollouts import (
 
 from mi_nerfattack.attack.freedom import offset_gradients
 from mi_nerfattack.deploy.surrogate.scene import field_sensor, showing
-from mi_nerfattack.render import composite
+from mi_nerfattack.render import composite, rays
 from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.render.camera.intrinsics import CameraMount
 from mi_nerfattack.rollout import sweep
 from mi_nerfattack.rollout.loop import CameraPath
 from mi_nerfattack.rollout.sensor import AbstractSensor
+from mi_nerfattack.vehicle.dynamics import to_state
 from mi_nerfattack.vehicle.integrators import RK4, ImplicitMidpoint
-from mi_nerfattack.vehicle.state import to_state
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -94,18 +93,19 @@ def test_attached_gradient_by_the_initial_state():
         assert central_difference(value, step) == expected
 
 
-def test_gradient_by_the_pose_of_an_object():
-    loop, _ = toy.make_loop()
+@pytest.mark.parametrize(
+    ("composite", "axes"), [("depth", range(6)), ("interleaved", [2])]
+)
+def test_gradient_by_the_pose_of_an_object(composite, axes):
+    loop, _ = toy.make_loop(composite=composite)
     rollout = make_rollout(loop, 4, attached=True)
     (item,) = loop.sensor.objects
     item.move(OFFSET[0])
     found = offset_gradients(loop.sensor, gradient(rollout, more=loop.sensor.pose_keys))
-    for axis in range(6):
+    for axis in axes:
 
         def value(s, axis=axis):
-            moved = OFFSET.copy()
-            moved[0, axis] += s
-            item.move(moved[0])
+            item.move(OFFSET[0] + s * np.eye(6)[axis])
             return objective(rollout)
 
         # samples that cross the faces of cells, kinks of the field, cost accuracy, as
@@ -113,19 +113,6 @@ def test_gradient_by_the_pose_of_an_object():
         scale = np.abs(found[0, 3 * (axis // 3) :][:3]).max()
         expected = pytest.approx(found[0, axis], rel=2e-2, abs=2e-2 * scale)
         assert central_difference(value, 3e-3) == expected
-
-
-def test_gradient_by_the_pose_through_the_interleaved_composite():
-    loop, _ = toy.make_loop(composite="interleaved")
-    rollout = make_rollout(loop, 3, attached=True)
-    by_pose = gradient(rollout, more=loop.sensor.pose_keys)
-    found = offset_gradients(loop.sensor, by_pose)[0, 2]
-
-    def value(s):
-        loop.sensor.objects[0].move(s * np.eye(6)[2])
-        return objective(rollout)
-
-    assert central_difference(value, 1e-3) == pytest.approx(found, rel=2e-2)
 
 
 def test_euler_needs_two_steps_to_feel_a_control():
@@ -172,7 +159,7 @@ def test_adjoints_agree_and_compile_nothing_after_the_first_steps():
 
 
 def test_memory_does_not_grow_with_the_horizon(monkeypatch):
-    monkeypatch.setattr(composite, "FIRST_RAYS", 64)  # wait for a launch, not more
+    monkeypatch.setattr(rays, "FIRST_RAYS", 64)  # wait for a launch, not more
     loop, _ = toy.make_loop(disturbance=DISTURBANCE)
     backend = dr.backend_v(mi.Float)
 
@@ -199,10 +186,7 @@ def test_the_heap_is_released_after_each_derivative_of_the_policy(monkeypatch):
 @pytest.mark.parametrize("adjoint", ADJOINTS)
 @pytest.mark.parametrize(
     "changes",
-    [
-        {"jitter_seed": 7, "disturbance": DISTURBANCE},
-        {"composite": "interleaved"},
-    ],
+    [{"jitter_seed": 7, "disturbance": DISTURBANCE}, {"composite": "interleaved"}],
 )
 def test_periods_together_give_the_gradient_of_periods_alone(
     adjoint, changes, monkeypatch
@@ -212,40 +196,39 @@ def test_periods_together_give_the_gradient_of_periods_alone(
     rollout = make_rollout(loop, 11, adjoint=adjoint)
     together = texture_gradient(rollout, POSES)
     monkeypatch.setattr(sweep, "IMAGES", 1)
-    monkeypatch.setattr(composite, "FIRST_RAYS", 1)
+    monkeypatch.setattr(rays, "FIRST_RAYS", 1)
     alone = texture_gradient(rollout, POSES)
     assert np.linalg.norm(alone) > 0
     assert np.linalg.norm(together - alone) <= 1e-5 * np.linalg.norm(alone)
 
 
 def test_a_sensor_without_derivatives_is_refused():
+    loop, _ = toy.make_loop()
+
     class Blind(AbstractSensor):
-        def __init__(self, sensor):
-            self.sensor = sensor
-
         def observe(self, state, step):
-            return self.sensor.observe(state, step)
+            return loop.sensor.observe(state, step)
 
+    with pytest.raises(TypeError, match="Blind: "):
+        gradient(make_rollout(replace(loop, sensor=Blind()), 1))
+
+
+def test_values_that_make_no_sense_are_refused():
     loop, _ = toy.make_loop()
-    blind = replace(loop, sensor=Blind(loop.sensor))
-    with pytest.raises(TypeError, match="Blind: has no derivatives"):
-        gradient(make_rollout(blind, 1))
-
-
-def test_horizon_below_one_and_bad_states_are_refused():
-    loop, _ = toy.make_loop()
-    with pytest.raises(ValueError, match="horizon"):
-        objective(make_rollout(loop, 0))
-    with pytest.raises(ValueError, match="states"):
-        to_state(np.array([[0.0, np.nan, 0.0]]))
-    with pytest.raises(ValueError, match="offset: .*; expected 6 finite numbers"):
-        loop.sensor.objects[0].move(np.full(6, np.nan))
-
-
-def test_objects_that_share_a_field_are_refused():
-    old = toy.make_loop()[0].sensor
-    with pytest.raises(ValueError, match="two of them share a field"):
-        field_sensor(old.layers[0], 2 * old.objects, old.intrinsics)
+    sensor = loop.sensor
+    for call, message in (
+        (lambda: objective(make_rollout(loop, 0)), "horizon"),
+        (lambda: to_state(np.array([[0.0, np.nan, 0.0]])), "states"),
+        (lambda: sensor.objects[0].move(np.full(6, np.nan)), "offset: .* 6 "),
+        (
+            lambda: field_sensor(
+                sensor.layers[0], 2 * sensor.objects, sensor.intrinsics
+            ),
+            "share",
+        ),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
 
 
 def test_another_mount_makes_another_image():
@@ -257,18 +240,36 @@ def test_another_mount_makes_another_image():
     assert np.abs(other.observe(state, 0).image.numpy() - before).max() > 0.01
 
 
+@pytest.mark.parametrize("attached", [False, True])
+def test_sensors_see_the_pose_alone_of_longer_states(attached):
+    sensor, found = toy.make_loop()[0].sensor, []
+    # as many as make (n, 4) and (n, 3) the same number of values in some order
+    poses = np.array([[0.0, 0.0, 0.1], [0.5, -0.3, 0.0], [0.2, 0.4, -0.2]])
+    for states in (poses, np.c_[poses, [0.3, -0.2, 0.1]]):
+        state = to_state(states)
+        seen = sensor.observe(state, 0)
+        weight = np.linspace(-1, 1, dr.width(seen.image.array), dtype=np.float32)
+        sensor.start_gradient()
+        d_image = mi.TensorXf(weight.reshape(seen.image.shape))
+        by_pose = sensor.vjp(seen, state, d_image, attached)
+        rows = by_pose.numpy()[:3] if attached else np.zeros(3)
+        texture = sensor.texture_gradients()[0].numpy().copy()
+        found.append((seen.image.numpy(), texture, rows))
+    short, long = found
+    np.testing.assert_array_equal(long[0], short[0])
+    np.testing.assert_allclose(long[1], short[1], rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(long[2], short[2], rtol=1e-4)
+
+
 def test_kept_frames_are_not_rendered_again():
     loop, _ = toy.make_loop()
     rollout = make_rollout(loop, 3, adjoint="kept")
     evaluation = rollout.run(loop.initial(INITIAL))
     kept = evaluation.trajectory.kept
-    bytes_kept = sum(
-        4 * dr.width(array)
-        for state, _ in kept
-        for march in state.seen
-        for array in (*march.radiance, march.opacity, march.moment)
-    )
-    assert bytes_kept == 3 * toy.WIDTH * toy.HEIGHT * 2 * 20  # as its docstring says
+    marches = [march for state, _ in kept for march in state.seen]
+    arrays = [(*march.radiance, march.opacity, march.moment) for march in marches]
+    floats = sum(dr.width(array) for parts in arrays for array in parts)
+    assert 4 * floats == 3 * toy.WIDTH * toy.HEIGHT * 2 * 20  # as its docstring says
     before = loop.sensor.renders
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(composite, "march", None)  # of fields, while a kernel is traced

@@ -1,4 +1,4 @@
-"""The tables of deployments: labels, refusals, and the places that they name."""
+"""The tables of deployments: labels, conditions, and what they build in."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import math
 
 import numpy as np
 import pytest
-from helpers.scenario_text import HEAD, write_named_files
-from helpers.small_fields import homogeneous
+from support.files.runs import HEAD, write_named_files
+from support.worlds.fields import homogeneous
 
 from mi_nerfattack.deploy.built_in import make_built_in
 from mi_nerfattack.deploy.car import CAR
 from mi_nerfattack.deploy.place import Conditions, bundled_place
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.scenario import deployment
@@ -20,7 +19,7 @@ from mi_nerfattack.scenario.deployment import Deployment, deployments, labelled
 from mi_nerfattack.scenario.scenario import load_scenario, portable_text
 from mi_nerfattack.scenario.vehicle import AckermannSection
 
-TWO = '[[deployment]]\nspp = 4\n[[deployment]]\nname = "dusk"\nsky = "evening"\n'
+TABLE, TABLES = "[deployment]\n", "[[deployment]]\n"
 
 
 @pytest.fixture
@@ -35,24 +34,20 @@ def load(tmp_path):
     return inner
 
 
-def labels(scenario):
-    return [label for label, _ in labelled(scenario.deployment)]
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
         ("", ["deployment"]),
-        ("[deployment]\nspp = 4\n", ["deployment"]),
-        ("[[deployment]]\nspp = 4\n", ["deployment"]),
-        ('[deployment]\nname = "lit"\n', ["lit"]),
-        (TWO, ["mitsuba", "dusk"]),
-        ('[deployment]\nenvironment = "mujoco_gl"\nsky = "noon"\n', ["deployment"]),
+        (f"{TABLE}spp = 4\n", ["deployment"]),
+        (f"{TABLES}spp = 4\n", ["deployment"]),
+        (f'{TABLE}name = "lit"\n', ["lit"]),
+        (f'{TABLES}{TABLES}name = "dusk"\n', ["mitsuba", "dusk"]),
+        (f'{TABLE}kind = "mujoco_gl"\n', ["deployment"]),
     ],
 )
 def test_environments_are_called_by_name(load, tmp_path, text, expected):
     scenario, read = load(text)
-    assert labels(scenario) == expected
+    assert [label for label, _ in labelled(scenario.deployment)] == expected
     (tmp_path / "portable.toml").write_text(portable_text(scenario, read))
     again, _ = load_scenario(tmp_path / "portable.toml")
     assert again.deployment == scenario.deployment
@@ -60,59 +55,11 @@ def test_environments_are_called_by_name(load, tmp_path, text, expected):
         assert scenario.model_dump(mode="json")["deployment"]["spp"] == 16
 
 
-def test_values_count_to_the_identity(load, tmp_path):
-    folder = tmp_path / "tape"
-    folder.mkdir()
-    (folder / "0.png").write_bytes(b"one")
-    text = (
-        '[[deployment]]\n[[deployment]]\nenvironment = "replay"\nrecording = "tape"\n'
-    )
-    first = load(text)[0].identity()
-    assert first["scenario.deployment[0].spp"] == "16"
-    (folder / "0.png").write_bytes(b"two")
-    second = load(text)[0].identity()
-    changed = {key for key in first if first[key] != second[key]}
-    assert changed == {"scenario.deployment[1].recording"}
-    portable = portable_text(*load(text))
-    assert f'recording = "{folder}"' in portable
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('[deployment]\nenvironment = "gazebo"\n', 'environment: must be "mitsuba" or'),
-        ('[deployment]\nenvironment = "surrogate"\n', "must be .* or .replay"),
-        ('[deployment]\nenvironment = "replay"\n', "recording: is missing; environme"),
-        ("[deployment]\nspp = 0\n", "deployment.spp: input should be greater"),
-        ('[deployment]\nsky = "night"\n', "deployment.sky: input should be 'day'"),
-        ('[deployment]\nname = "a/b"\n', "deployment.name: string should match"),
-        ('[deployment]\nname = "surrogate"\n', "each a name of its own, which is not"),
-        ("[[deployment]]\n[[deployment]]\n", r"\['mitsuba', 'mitsuba'\]; give each"),
-        ("[[deployment]]\n[[deployment]]\nsky = 1\n", "scenario.toml:15: depl.*1.sky"),
-        (
-            '[deployment]\nenvironment = "carla"\nobjects = "built-in"\n',
-            'objects: has no meaning with environment = "carla"',
-        ),
-        (
-            '[vehicle]\nmodel = "custom"\nfunction = "car.py:car"\n'
-            "control_limit = 1.0\n"
-            '[deployment]\nenvironment = "mujoco"\n',
-            "mujoco drives a car with wheels.*take mitsuba",
-        ),
-    ],
-)
-def test_refusals_name_key_and_remedy(load, text, message):
-    with pytest.raises(InputError, match=message):
-        load(text)
-
-
 def test_conditions_are_those_of_the_table(load):
     given = {"sky": "noon", "exposure_ev": -0.5, "blur_px": 0.5, "noise_sd": 0.1}
     keys = "\n".join(f"{name} = {value!r}" for name, value in given.items())
-    for environment, more in (("mitsuba", {"spp": 4}), ("mujoco_gl", {})):
-        head = f'[deployment]\nenvironment = "{environment}"\n{keys}\n'
-        more_keys = "".join(f"{name} = {value}\n" for name, value in more.items())
-        section = load(head + more_keys)[0].deployment
+    for kind, more in (('"mitsuba"\nspp = 4', {"spp": 4}), ('"mujoco_gl"', {})):
+        section = load(f"{TABLE}kind = {kind}\n{keys}\n")[0].deployment
         found = deployments(section, bundled_place())["deployment"].conditions
         assert found == Conditions(**given, **more)
 
@@ -120,7 +67,7 @@ def test_conditions_are_those_of_the_table(load):
 def test_the_car_with_wheels_is_the_vehicles_size(load):
     assert load("")[0].vehicle.car() == CAR
     small = AckermannSection(
-        model="ackermann", width_m=0.3, wheelbase_m=0.325, max_steer_deg=20.0
+        kind="ackermann", width_m=0.3, wheelbase_m=0.325, max_steer_deg=20.0
     ).car()
     assert small.control_unit == "rad" and small.wheelbase == 0.325
     assert small.max_control == small.max_steer == pytest.approx(math.radians(20))

@@ -1,4 +1,4 @@
-"""The scenario file: defaults, refusals with lines, paths."""
+"""The scenario file: defaults, paths, what counts to its identity, portable text."""
 
 from __future__ import annotations
 
@@ -6,56 +6,46 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.scenario_text import write_named_files
+from support.files.runs import HEAD, write_named_files
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io.resumable import differences
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.scenario.named_file import NamedFile
 from mi_nerfattack.scenario.scenario import load_scenario, portable_text
 from mi_nerfattack.scenario.world import initial_states
 from mi_nerfattack.scenes import resolve
 from mi_nerfattack.vehicle.route.route import Route
 
-MINIMAL = """\
-name = "test"
-[scene]
-field = "scene.safetensors"
-deployment = "bundled:intersection/scene.xml"
-routes = "routes.json"
-route = "right"
-
-[[objects]]
-id = "hydrant"
-field = "object.safetensors"
-position_m = [1.0, 2.0, 0.0]
-
-[[objects]]
-id = "second"
-field = "object.safetensors"
-position_m = [1.0, 2.0, 0.0]
-scale = 2.0
-
-[policy]
-file = "policy.safetensors"
-[attack]
-max_iterations = 3
-"""
+POLICY = 'file = "policy.safetensors"'
 
 
 @pytest.fixture
-def write(tmp_path):
-    def inner(text):
+def load(tmp_path):
+    """Return a function that reads the scenario of a text, or of its file's path."""
+
+    def inner(text, *field):
         path = tmp_path / "scenario.toml"
         path.write_text(text)
-        return path
+        return load_scenario(path, *field)
 
     return inner
 
 
-def test_defaults_and_text(write):
-    scenario, text = load_scenario(write(MINIMAL))
-    assert text == MINIMAL
+def replayed(scenario, text, folder):
+    """Read the text of a run from another folder."""
+    folder.mkdir()
+    path = folder / "scenario.toml"
+    path.write_text(portable_text(scenario, text))
+    return load_scenario(path)[0]
+
+
+def test_defaults_and_text(load):
+    text = f"{HEAD}[attack.method]\nmax_iterations = 3\n"
+    text += HEAD[HEAD.index("[[") : HEAD.index("[policy]")].replace("hydrant", "other")
+    scenario, read = load(f"{text}scale = 2.0\n")
+    assert read == f"{text}scale = 2.0\n"
     assert scenario.attack.method.max_iterations == 3
     assert scenario.camera.width == 200 and scenario.camera.height == 66
     assert [item.scale for item in scenario.objects] == [1.0, 2.0]
@@ -64,165 +54,81 @@ def test_defaults_and_text(write):
 LENS = "fx = 175.5\nfy = 170\ncx = 165\nk1 = -0.17\nk2 = 0.03\np1 = 1e-3\n"
 
 
-def test_a_measured_lens_takes_the_place_of_an_angle(write):
-    size = "[camera]\nwidth = 336\nheight = 188\n"
-    scenario, _ = load_scenario(write(MINIMAL + size + LENS))
-    camera, _ = scenario.camera.build()
+def test_a_measured_lens_takes_the_place_of_an_angle(load):
+    text = HEAD + "[camera]\nwidth = 336\nheight = 188\n"
+    camera, _ = load(text + LENS)[0].camera.build()
     bent = {"k1": -0.17, "k2": 0.03, "p1": 1e-3}
     assert camera == Camera(336, 188, 175.5, 170.0, 165.0, 94.0, **bent)
-    scenario, _ = load_scenario(write(MINIMAL + size + "fx = 200\n"))
-    assert scenario.camera.build()[0] == Camera(336, 188, 200.0, 200.0, 168.0, 94.0)
+    camera, _ = load(text + "fx = 200\n")[0].camera.build()
+    assert camera == Camera(336, 188, 200.0, 200.0, 168.0, 94.0)
+
+
+TERM = "[[objective.term]]\nkind = "
+CODE = f'{POLICY}\n{TERM}"function"\nfunction = "costs.py:f"'
+TARGET = f'{POLICY}\n{TERM}"target_path"\ntarget = "a.json"\ntarget_route = "verge"'
+NET = 'file = "net.py:make"\nweights_file = "w.pt"'
+CAR = 'file = "a.onnx"\n[vehicle]\nkind = "custom"\ncontrol_limit = 1.0\nfunction = '
+TAPE = f'{POLICY}\n[[deployment]]\n[[deployment]]\nkind = "replay"\nrecording = "tape"'
 
 
 @pytest.mark.parametrize(
-    ("lines", "message"),
+    ("policy", "name", "key"),
     [
-        ("fx = 200\nfov_x_deg = 70", "camera.fx: stands beside fov_x_deg"),
-        ("fy = 200", "camera.fy: stands without fx"),
-        ("fx = 0", "camera.fx: "),
-        ("k1 = -3", "camera.k1: .*folds the image over itself"),
+        (POLICY, "policy.safetensors", "policy.file"),
+        (POLICY, "scene.safetensors", "scene.field"),
+        (CODE, "costs.py", "objective.term[0].function"),
+        (TARGET, "a.json", "objective.term[0].target"),
+        (NET, "net.py", "policy.file"),
+        (NET, "w.pt", "policy.weights_file"),
+        (f'{CAR}"car.py:car"', "car.py", "vehicle.function"),
+        (TAPE, "tape/0.png", "deployment[1].recording"),
     ],
 )
-def test_impossible_lenses_are_refused(write, lines, message):
-    with pytest.raises(InputError, match=message):
-        load_scenario(write(MINIMAL + f"[camera]\n{lines}\n"))
-
-
-def test_digest_tells_scenarios_apart(write, tmp_path):
+def test_the_content_of_a_named_file_counts(load, tmp_path, policy, name, key):
     write_named_files(tmp_path)
+    (tmp_path / "tape").mkdir()
+    for each in ("costs.py", "a.json", "net.py", "w.pt", "a.onnx", "car.py", name):
+        (tmp_path / each).write_text("1")
+    text = HEAD.replace(POLICY, policy)
+    before, read = load(text)
+    assert load(f"# remark\n{text}")[0].digest() == before.digest()
+    assert replayed(before, read, tmp_path / "other").digest() == before.digest()
+    first, digest = before.identity(), before.digest()
+    (tmp_path / name).write_text("2")
+    after, _ = load(text)
+    second = after.identity()
+    assert {k for k in first if first[k] != second[k]} == {f"scenario.{key}"}
+    assert after.digest() != digest
 
-    def digest(text):
-        return load_scenario(write(text))[0].digest()
 
-    first = digest(MINIMAL)
-    assert first == digest("# remark\n" + MINIMAL)
-    assert first == digest(portable_text(*load_scenario(write(MINIMAL))))
-    assert first != digest(MINIMAL.replace("= 3", "= 4"))
-    (tmp_path / "policy.safetensors").write_bytes(b"another policy")
-    assert first != digest(MINIMAL)
+def test_values_and_names_of_functions_count(load, tmp_path):
+    write_named_files(tmp_path)
+    (tmp_path / "costs.py").write_text("1")
+    text = HEAD.replace(POLICY, CODE)
+    texts = HEAD, f"{HEAD}[drive]\nhorizon = 4\n", text, text.replace(":f", ":g")
+    assert len({load(each)[0].digest() for each in texts}) == 4
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "line", "words"),
-    [
-        (
-            "max_iterations = 3",
-            "max_iteratons = 3",
-            22,
-            ["max_iteratons", "unknown", "max_iterations"],
-        ),
-        ("max_iterations = 3", "max_iterations = 0", 22, ["max_iterations", "0"]),
-        ("max_iterations = 3", 'max_iterations = "3"', 22, ["max_iterations"]),
-        ("scale = 2.0", "scale = -2.0", 17, ["scale", "-2"]),
-        ("scale = 2.0", "scale = nan", 17, ["scale"]),
-        ('route = "right"\n', "", 2, ["route", "required"]),
-        ("[policy]", "[polisy]", 19, ["polisy"]),
-        ('id = "second"', 'id = "hydrant"', None, ["hydrant", "differ"]),
-        ('id = "second"', 'id = "scene1"', None, ["scene1", "layers"]),
-        ('id = "second"', 'id = "background"', None, ["background", "layers"]),
-        ("[attack]", "[attack", None, ["scenario.toml"]),
-        ("[attack]", "[attack]\nlowest = 0.9\nhighest = 0.2", 22, ["lowest", "0.2"]),
-        (
-            "[attack]",
-            "[attack]\nfixed_m = [[[0, 0, 0], [0, 1, 1]]]",
-            22,
-            ["fixed_m", "lower < upper"],
-        ),
-        ("[attack]", '[attack]\ngamut = "none.icc"', 22, ["gamut", "none.icc"]),
-        ("[attack]", "[attack]\nsegment = 8", 22, ["segment", "checkpointed"]),
-        ("[attack]", "[attack]\npose_limit_m = 2.0", 22, ["pose_limit_m", "both"]),
-        (
-            "[attack]",
-            '[attack]\nparameters = "pose"\nlearning_rate = 0.2',
-            23,
-            ["learning_rate", "pose"],
-        ),
-        ("[attack]", "[vehicle]\nwheelbase_m = 3.0\n[attack]", 22, ["ackermann"]),
-        (
-            "[attack]",
-            '[vehicle]\nmodel = "bicycle"\nmax_heading_rate = 3.0\n[attack]',
-            23,
-            ["max_heading_rate", "dubins"],
-        ),
-        (
-            "[attack]",
-            "[drive]\ncovariance = [[1, 0, 0], [0, 1, 0.5], [0, 0, 1]]\n[attack]",
-            22,
-            ["covariance", "symmetric"],
-        ),
-        (
-            "[attack]",
-            "[drive]\ncovariance = [[1, 2, 0], [2, 1, 0], [0, 0, 1]]\n[attack]",
-            22,
-            ["covariance", "eigenvalue -1;"],
-        ),
-        (
-            "[attack]",
-            "[drive]\nlateral_sd_m = 0.2\ncovariance = [[1, 0, 0], [0, 1, 0], "
-            "[0, 0, 1]]\n[attack]",
-            23,
-            ["covariance", "lateral_sd_m"],
-        ),
-        (
-            "[attack]",
-            "[drive]\nlength_m = 3.0\nhorizon = 60\n[attack]",
-            23,
-            ["horizon", "length_m", "give one of them"],
-        ),
-    ],
-)
-def test_errors_name_key_and_line(write, old, new, line, words):
-    path = write(MINIMAL.replace(old, new))
+def test_all_problems_of_a_table_are_told_at_once(load):
+    text = "[attack.method]\nposes = 0\nfoo = 1\n[attack]\nbar = 2\n"
     with pytest.raises(InputError) as caught:
-        load_scenario(path)
-    message = str(caught.value)
-    assert str(path) in message
-    for word in words:
-        assert word in message
-    if line is not None:
-        assert f"{path}:{line}" in message
-
-
-def test_all_problems_of_a_table_are_told_at_once(write):
-    text = (
-        MINIMAL + "poses = 0\nfoo = 1\nsegment = 2\n[vehicle]\nspeed_ms = -1\nx = 1\n"
-    )
-    with pytest.raises(InputError) as caught:
-        load_scenario(write(text + 'model = "custom"\n'))
+        load(f'{HEAD}{text}[vehicle]\nspeed_ms = -1\nx = 1\nkind = "custom"\n')
     keys = [line.split(": ")[1] for line in str(caught.value).split("\n")]
     assert sorted(keys) == [
-        *(f"attack.{key}" for key in ("foo", "poses", "segment")),
+        *(f"attack.{key}" for key in ("bar", "method.foo", "method.poses")),
         *(f"vehicle.{key}" for key in ("control_limit", "function", "speed_ms", "x")),
     ]
 
 
-def test_a_wrong_object_is_one_problem(write):
-    text = MINIMAL.replace("position_m = [1.0, 2.0, 0.0]\nscale", "scale")
-    first = MINIMAL.index("[[objects]]")
-    text = text[:first] + text[text.index("[[objects]]", first + 1) :]
-    with pytest.raises(InputError, match=r"objects.0.position_m: [^\n]*$") as caught:
-        load_scenario(write(text))
-    assert "\n" not in str(caught.value)
-
-
 @pytest.mark.parametrize("unit", ["rad/s", "rad"])
-def test_a_vehicle_takes_pilotnets_unit_or_a_factor_to_its_own(write, tmp_path, unit):
+def test_a_vehicle_takes_pilotnets_unit_or_a_factor_to_its_own(load, tmp_path, unit):
     PilotNet(goals=1, max_control=0.4, unit=unit).save(tmp_path / "policy.safetensors")
-    steered = '[vehicle]\nmodel = "ackermann"\n[attack]'
-    turned = MINIMAL.replace("[attack]", steered)
-    fits, fits_not = (turned, MINIMAL) if unit == "rad" else (MINIMAL, turned)
-    assert load_scenario(write(fits))[0].policy.unit() == unit
-    with pytest.raises(InputError, match=f"vehicle.model: .* gives {unit}; take ano"):
-        load_scenario(write(fits_not))
-    scaled = fits_not.replace(
-        '"policy.safetensors"', '"policy.safetensors"\ncontrol_scale = 2'
-    )
-    load_scenario(write(scaled))
-
-
-def test_missing_file(tmp_path):
-    with pytest.raises(InputError, match="absent.toml"):
-        load_scenario(tmp_path / "absent.toml")
+    turned = f'{HEAD}[vehicle]\nkind = "ackermann"\n'
+    fits, fits_not = (turned, HEAD) if unit == "rad" else (HEAD, turned)
+    assert load(fits)[0].policy.unit() == unit
+    with pytest.raises(InputError, match=f"vehicle.kind: .* gives {unit}; take ano"):
+        load(fits_not)
+    load(fits_not.replace(POLICY, f"{POLICY}\ncontrol_scale = 2"))
 
 
 def test_resolve(tmp_path):
@@ -231,29 +137,15 @@ def test_resolve(tmp_path):
     assert resolve("bundled:intersection/routes.json", tmp_path).is_file()
     with pytest.raises(InputError, match="bundled"):
         resolve("bundled:nothing.toml", tmp_path)
-
-
-def test_text_of_a_run_replays_anywhere(write, tmp_path):
-    path = write(MINIMAL)
-    scenario, text = load_scenario(path, tmp_path / "mine.safetensors")
-    portable = tmp_path / "elsewhere" / "scenario.toml"
-    portable.parent.mkdir()
-    portable.write_text(portable_text(scenario, text))
-    again, _ = load_scenario(portable)
-    mine = str(tmp_path / "mine.safetensors")
-    assert [item.field.name for item in again.objects] == [mine, mine]
-    assert [item.field.name for item in scenario.objects] == [mine, mine]
-    assert again.scene.field.name == str(tmp_path / "scene.safetensors")
-    assert again.scene.deployment.name == "bundled:intersection/scene.xml"
-    assert again.policy.source == str(tmp_path / "policy.safetensors")
+    with pytest.raises(InputError, match="absent.toml"):
+        load_scenario(tmp_path / "absent.toml")
 
 
 @pytest.mark.parametrize("rank", [1, 3])
-def test_initial_poses_scatter_by_the_covariance(write, rank):
+def test_initial_poses_scatter_by_the_covariance(load, rank):
     root = np.random.default_rng(0).normal(size=(3, rank)) * [[0.5], [0.2], [0.02]]
     wanted = root @ root.T
-    text = f"[drive]\ncovariance = {wanted.tolist()}\n[attack]"
-    scenario, _ = load_scenario(write(MINIMAL.replace("[attack]", text)))
+    scenario, _ = load(f"{HEAD}[drive]\ncovariance = {wanted.tolist()}\n")
     route = Route("north", 0, np.array([[2.0, 1.0], [2.0, 9.0], [4.0, 20.0]]))
     states = initial_states(scenario, route, 20001, 0)
     # along the lane is +y, to the left of it -x
@@ -276,92 +168,111 @@ def test_initial_poses_scatter_by_the_covariance(write, rank):
         ("start_m = 13.2", True, 86),  # a lap of 43.45 m
     ],
 )
-def test_drives_end_with_the_route_or_before(write, keys, closed, steps):
+def test_drives_end_with_the_route_or_before(load, keys, closed, steps):
     route = Route("bend", 0, np.array([[0, 0], [3.2, 0], [3.2, 20]]), closed=closed)
-    text = MINIMAL.replace("[attack]", f"[drive]\n{keys}\n[attack]")
-    scenario, _ = load_scenario(write(text))
+    scenario, _ = load(f"{HEAD}[drive]\n{keys}\n")
     assert scenario.drive.steps(route, 0.1) == steps
 
 
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        ('[policy]\nfile = "policy.safetensors"\n', ""),
-        ('file = "policy.safetensors"', '"file" = "policy.safetensors"'),
-        ('file = "policy.safetensors"', 'file = """\\\n   policy.safetensors"""'),
-        ("= 3", "= 3\n[policy.preprocess]\nframes = 2"),
+        ("", 'policy.file = "policy.safetensors"  # why\n'),
+        (POLICY, '"file" = "policy.safetensors"'),
+        (POLICY, 'file = """\\\n   policy.safetensors"""'),
+        (POLICY, f"{POLICY}\n[policy.preprocess]\nframes = 2"),
+        ('"object.safetensors"', r'"it\u0073 \"ö\".st"'),
     ],
 )
-def test_every_form_of_toml_replays_anywhere(write, tmp_path, old, new):
-    """Inline tables, quoted keys, long strings, tables in another order."""
-    assert old in MINIMAL
-    text = MINIMAL.replace(old, new)
-    if not new:
-        text = 'policy.file = "policy.safetensors"  # why\n' + text
-    portable = portable_text(*load_scenario(write(text)))
-    assert portable.count("# why") == text.count("# why")
-    (elsewhere := tmp_path / "elsewhere.toml").write_text(portable)
-    again, _ = load_scenario(elsewhere)
+def test_every_form_of_toml_replays_anywhere(load, tmp_path, old, new):
+    """Dotted and quoted keys, long strings, tables in another order, escapes."""
+    text = HEAD.replace(old, new) if old else new + HEAD.partition("[policy]")[0]
+    scenario, text = load(text.replace("deployment.xml", "bundled:demo.xml"))
+    assert portable_text(scenario, text).count("# why") == text.count("# why")
+    again = replayed(scenario, text, tmp_path / "elsewhere")
     assert again.policy.source == str(tmp_path / "policy.safetensors")
+    assert again.scene.deployment.name == "bundled:demo.xml"
+    name = 'its "ö".st' if "ö" in new else "object.safetensors"
+    assert again.objects[0].field.name == str(tmp_path / name)
+    assert scenario.objects[0].field.path == Path(tmp_path / name)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "line"),
-    [
-        ('[policy]\nfile = "p', 'policy = { file = "a.onnx", batch = 2 }\n#', 19),
-        ('name = "test"', 'attack.max_iterations = 0\nname = "test"', 1),
-        ("[attack]", '[policy.preprocess]\nmean = [\n  0.5,\n  "a",\n]\n[attack]', 22),
-        ("max_iterations = 3", "max_iterations = 3\nmean.x = 1", 23),
-        (
-            "max_iterations = 3",
-            "max_iterations = 3\nmean.x = 1\nseed = 3\nmean.y = 1",
-            23,
-        ),
-        ("[attack]\nmax_iterations = 3", "[mean.x]\ny = 1", 21),
-    ],
-)
-def test_lines_of_every_form(write, old, new, line):
-    text = MINIMAL.replace(old, new)
-    if "attack" in new and "policy" not in new:
-        text = text[: text.index("[attack]")]
-    elif "{" in new:  # an inline table stands before the first table
-        text = "\n" * 18 + new + "\n" + MINIMAL.replace(old, "#")
-    with pytest.raises(InputError, match=f"scenario.toml:{line}: "):
-        load_scenario(write(text))
+def test_another_field_for_every_object_replays_anywhere(load, tmp_path):
+    scenario, text = load(HEAD, tmp_path / "mine.safetensors")
+    for read in (scenario, replayed(scenario, text, tmp_path / "elsewhere")):
+        assert read.objects[0].field.name == str(tmp_path / "mine.safetensors")
 
 
-def test_escapes_in_paths_survive(write, tmp_path):
-    text = MINIMAL.replace("object.safetensors", r"it\u0073 \"ö\".st")
-    scenario, text = load_scenario(write(text))
-    portable = tmp_path / "elsewhere.toml"
-    portable.write_text(portable_text(scenario, text))
-    again, _ = load_scenario(portable)
-    wanted = str(tmp_path / 'its "ö".st')
-    assert [item.field.name for item in again.objects] == [wanted, wanted]
-    assert [item.field.path for item in scenario.objects] == [Path(wanted)] * 2
-
-
-def test_module_of_a_vehicle_counts_with_its_source(write, tmp_path, monkeypatch):
+def test_module_of_a_vehicle_counts_with_its_source(load, tmp_path, monkeypatch):
     package = tmp_path / "cars_of_this_test"
     package.mkdir()
     (package / "__init__.py").write_text("raise AssertionError('was imported')")
-    source = package / "slow.py"
-    source.write_text("speed = 1")
+    (package / "slow.py").write_text("speed = 1")
     monkeypatch.syspath_prepend(tmp_path)
-    vehicle = '[vehicle]\nmodel = "custom"\ncontrol_limit = 1.0\nfunction = '
     write_named_files(tmp_path)
+    (tmp_path / "a.onnx").write_text("policy")
 
     def identity(reference):
-        text = MINIMAL.replace("[attack]", f'{vehicle}"{reference}"\n[attack]')
-        return load_scenario(write(text))[0].identity()
+        scenario, text = load(HEAD.replace(POLICY, f'{CAR}"{reference}"'))
+        assert f'"{reference}"' in portable_text(scenario, text)
+        return scenario.identity()
 
     before = identity("cars_of_this_test.slow:car")
     assert before == identity("cars_of_this_test.slow:car")
-    source.write_text("speed = 2")
-    assert differences(before, identity("cars_of_this_test.slow:car")) == [
-        "scenario.vehicle.function: the content of cars_of_this_test.slow:car has "
-        "changed"
-    ]
-    identity("cars_of_this_test.absent:car")  # refused later, where it is imported
-    identity("absent_package.absent:car")
-    identity("math.absent:car")
+    (package / "slow.py").write_text("speed = 2")
+    (changed,) = differences(before, identity("cars_of_this_test.slow:car"))
+    assert changed.startswith("scenario.vehicle.function: ")
+    for absent in ("cars_of_this_test.absent", "absent_package.absent", "math.absent"):
+        identity(f"{absent}:car")  # refused later, where it is imported
+
+
+BITMAP = '<texture type="bitmap" id="t"><string name="filename" {}/></texture>'
+SPECTRUM = '<bsdf type="conductor" id="c"><spectrum name="eta" filename="{}"/></bsdf>'
+DEFAULT = '<default name="{}" value="{}"/>'.format
+DEFAULT_BACKWARDS = '<default value="{}" name="{}"/>'.format
+WAYS = {
+    "single quotes": ("t.png", BITMAP.format("value='t.png'")),
+    "spaces": ("t.png", BITMAP.format('value  = "t.png"')),
+    "line break": ("t.png", BITMAP.format('value=\n"t.png"')),
+    "parameter": ("t.png", DEFAULT("w", "t") + BITMAP.format('value="$w.png"')),
+    "entity": ("a&b.png", BITMAP.format('value="a&amp;b.png"')),
+    "search path": ("in/t.png", '<path value="in"/>' + BITMAP.format('value="t.png"')),
+    "included": ("t.png", '<include filename="inner.xml"/>'),
+    "spectrum": ("s.spd", DEFAULT("s", "s.spd") + SPECTRUM.format("$s")),
+    "spectrum with an entity": ("a&b.spd", SPECTRUM.format("a&amp;b.spd")),
+    "spectrum of a default of defaults": (
+        "s.spd",
+        DEFAULT_BACKWARDS("s", "d")
+        + DEFAULT_BACKWARDS("$d.spd", "s")
+        + SPECTRUM.format("$s"),
+    ),
+    "comment that XML forbids": (
+        "t.png",
+        "<!-- a -- b -->" + BITMAP.format("value='t.png'"),
+    ),
+}
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("way", WAYS)
+def test_a_changed_file_is_noticed(tmp_path, way):
+    name, body = WAYS[way]
+    named, scene = tmp_path / name, tmp_path / "scene.xml"
+    named.parent.mkdir(exist_ok=True)
+    inner = BITMAP.format("value='t.png'")
+    (tmp_path / "inner.xml").write_text(f'<scene version="3.0.0">{inner}</scene>')
+    scene.write_text(f"<scene version='3.0.0'>{body}</scene>")
+    found = []
+    for value in ("400 1\n700 1\n", "400 1\n700 2\n"):
+        named.write_text(value)
+        found.append(NamedFile("scene.xml", scene).content()["sha256"])
+    assert found[0] != found[1]
+
+
+@pytest.mark.usefixtures("variant")
+def test_a_scene_that_cannot_be_read_is_refused(tmp_path):
+    scene = tmp_path / "scene.xml"
+    body = "<string name='filename' value='$t'/>"
+    scene.write_text(f"<scene version='3.0.0'>{body}</scene>")
+    with pytest.raises(InputError, match=r"undefined parameter.*\$t.*<default>"):
+        NamedFile("scene.xml", scene).content()

@@ -10,13 +10,23 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import small_fields as small
-from helpers import splat_files as made
-from helpers.variants import MONO, RGB, SPECTRAL
+from support.files import objects as made
+from support.reference.derivatives import (
+    MONO,
+    RGB,
+    SPECTRAL,
+    Derivatives,
+    images,
+    key_of,
+)
+from support.worlds import fields as small
 
 from mi_nerfattack.backend.colour import srgb_to_linear_numpy
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import save_field
+from mi_nerfattack.scenario.scenario import load_scenario
+from mi_nerfattack.scenario.world import build_world
+from mi_nerfattack.vehicle.dynamics import to_state
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -97,12 +107,25 @@ def test_surfaces_end_the_march(paths) -> None:
 def test_a_texture_in_front_of_splats_has_a_gradient(paths) -> None:
     world = scene(paths, 0.0)
     params = mi.traverse(world)
-    (key,) = [key for key in params.keys() if key.endswith("colour")]
+    key = key_of(params, "colour")
     dr.enable_grad(params[key])
     params.update()
     image = mi.render(world, params, spp=1)
     dr.backward(dr.sum(image[..., 0]))
     assert float(np.abs(dr.grad(params[key]).numpy()).max()) > 0
+
+
+@pytest.mark.parametrize("name", ["harmonics", "opacity"])
+def test_splats_have_derivatives(rng, paths, name: str) -> None:
+    made.write_ply(Path(paths["wall.ply"]), made.columns(made.cloud(rng, 200)))
+    world = scene(paths, 4.5)
+    params = mi.traverse(world)
+    key = key_of(params, f"street.{name}")
+    base = params[key].numpy().copy()
+    along = rng.uniform(-1, 1, base.shape) * (
+        base * (1 - base) if name == "opacity" else 1
+    )
+    Derivatives(params, key, images(world, params)).check([along])
 
 
 @pytest.mark.parametrize("each_variant", RGB + SPECTRAL + MONO, indirect=True)
@@ -118,25 +141,46 @@ def test_every_variant_shows_splats(paths, each_variant: str) -> None:
     np.testing.assert_allclose(mean, expected, atol=8e-3)
 
 
+def reasons(err: BaseException | None) -> str:
+    """Return the messages of an error and of its causes."""
+    return "" if err is None else f"{err} {reasons(err.__cause__)}"
+
+
 def test_what_cannot_be_shown_is_refused(paths) -> None:
-    with pytest.raises(RuntimeError, match="wall.ply: .* set composite to depth"):
-        scene(paths, 0.0, integrator={"composite": "interleaved"})
-    lit = {"type": "grid_field", "filename": paths["cube.safetensors"], "relit": True}
-    with pytest.raises(RuntimeError, match="wall.ply: .* set relit to false"):
-        scene(paths, 0.0, integrator={"object": lit})
+    grid = {"type": "grid_field", "filename": paths["cube.safetensors"]}
+    splat = {"type": "splat_background", "filename": paths["wall.ply"]}
+    emitter = {"type": "field_emitter", "a": grid, "b": splat}
+    shear = splat | {"to_world": mi.ScalarTransform4f().scale([1, 2, 1])}
+    lit = {"object": grid | {"relit": True}}
+    for make, message in (
+        (lambda: scene(paths, 0, integrator={"composite": "interleaved"}), "to depth"),
+        (lambda: scene(paths, 0, integrator=lit), "wall.ply: .* set relit to false"),
+        (lambda: mi.load_dict(emitter), "cannot use the nested SplatBackground"),
+        (
+            lambda: mi.load_dict({"type": "heterogeneous", "sigma_t": splat}),
+            "is no medium",
+        ),
+        (lambda: mi.load_dict(shear), "to_world"),
+    ):
+        with pytest.raises(RuntimeError, match=message):
+            make()
+    params = mi.traverse(scene(paths, 0.0))
+    for name, value in (("opacity", 1.1), ("opacity", np.nan), ("harmonics", np.inf)):
+        key = key_of(params, f"street.{name}")
+        before = mi.Float(params[key])
+        params[key] = dr.full(mi.Float, value, dr.width(before))
+        with pytest.raises(InputError, match=f"wall.ply: {name} "):
+            params.update()
+        params[key] = before
+    world = scene(paths, 0.0)
+    frozen = dr.freeze(lambda seed: mi.render(world, spp=1, seed=seed))
+    with pytest.raises(RuntimeError) as caught:
+        frozen(mi.UInt32(0))
+    assert "render each frame as it is" in reasons(caught.value)
     data = mi.TensorXf([[0, 0, 0, 1, 1, 1, 0, 0, 0, 1]])
     world = scene(paths, 0.0, dots={"type": "ellipsoids", "data": data})
     with pytest.raises(InputError, match="dots: .* nest a splat_background"):
         world.integrator().render(world, spp=1)
-    splat = {"type": "splat_background", "filename": paths["wall.ply"]}
-    with pytest.raises(RuntimeError, match="cannot use the nested SplatBackground"):
-        more = {"type": "grid_field", "filename": paths["cube.safetensors"]}
-        mi.load_dict({"type": "field_emitter", "a": more, "b": splat})
-    with pytest.raises(RuntimeError, match="is no medium"):
-        mi.load_dict({"type": "heterogeneous", "sigma_t": splat})
-    shear = mi.ScalarTransform4f().scale([1, 2, 1])
-    with pytest.raises(RuntimeError, match="to_world"):
-        mi.load_dict(splat | {"to_world": shear})
 
 
 # The scenario
@@ -164,9 +208,6 @@ height = 6
 @pytest.fixture
 def build(paths):
     """Return a function that builds the world of a scenario text."""
-    from mi_nerfattack.scenario.scenario import load_scenario
-    from mi_nerfattack.scenario.world import build_world
-
     folder = Path(paths["wall.ply"]).parent
     points = [[-20.0, 0.0], [60.0, 0.0]]
     route = {"goal": 0, "lane_width_m": 3.5, "speed_ms": 5.0, "points_m": points}
@@ -183,8 +224,6 @@ def build(paths):
 
 
 def test_a_scenario_drives_among_splats(build) -> None:
-    from mi_nerfattack.vehicle.state import to_state
-
     sensor = build(SCENARIO).surrogate
     seen = sensor.observe(to_state(np.zeros((1, 3))), 0).kept.seen
     depth = seen.layers[0].depth.numpy().reshape(6, 12)  # the wall at x = 9
@@ -198,15 +237,15 @@ def test_steps_and_the_end_of_rays_are_the_scenarios(build) -> None:
     assert (world.surrogate.integrator.stop, world.fields[0].step_m) == (0.01, 0.5)
 
 
-def test_scenarios_with_splats_refuse_what_they_cannot_do(build) -> None:
-    with pytest.raises(InputError, match="scene.step_m: .*wall.ply holds splats"):
-        build(SCENARIO.replace("[scene]", "[scene]\nstep_m = 0.1"))
-    with pytest.raises(InputError, match="wall.ply: .* set attack.attached to false"):
-        build(SCENARIO + "[attack]\nattached = true\n")
-    text = SCENARIO.replace("[scene]", '[scene]\ncomposite = "interleaved"')
-    with pytest.raises(InputError, match="wall.ply: .* set composite to depth"):
-        build(text)
-    with pytest.raises(InputError, match="scene.to_world: .*expected a 3x3 rotation"):
-        build(SCENARIO.replace("[[2, 0", "[[3, 0"))
-    with pytest.raises(InputError, match=r"scenario.toml:4: scene.to_world"):
-        build(SCENARIO.replace("[[2, 0", '[["2", 0'))
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[scene]", "[scene]\nstep_m = 0.1", "scene.step_m: .*wall.ply holds splats"),
+        ("[scene]", '[scene]\ncomposite = "interleaved"', "set composite to depth"),
+        ("[[2, 0", "[[3, 0", "scene.to_world: .*expected a 3x3 rotation"),
+        ("[[2, 0", '[["2", 0', r"scenario.toml:4: scene.to_world"),
+    ],
+)
+def test_what_scenarios_with_splats_cannot_do(build, old, new, message) -> None:
+    with pytest.raises(InputError, match=message):
+        build(SCENARIO.replace(old, new))

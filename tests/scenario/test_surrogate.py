@@ -1,20 +1,22 @@
-"""Scenarios whose surrogate is a Mitsuba scene."""
+"""Scenarios whose surrogate is a Mitsuba scene, the demo's, and where drives start."""
 
 from __future__ import annotations
 
-import json
-
+import mitsuba as mi
 import numpy as np
 import pytest
-from helpers.attack_jobs import write_scenario
+from support.worlds.attacks import write_scenario
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.metrics import validate
 from mi_nerfattack.experiment.checks.before_attack import place_findings
+from mi_nerfattack.io import files
 from mi_nerfattack.io.exr import read_layers
+from mi_nerfattack.rollout import SceneSensor
 from mi_nerfattack.scenario.scenario import load_scenario
-from mi_nerfattack.scenario.world import build_surrogate, build_world
-from mi_nerfattack.vehicle.state import to_state
+from mi_nerfattack.scenario.world import build_attack, build_surrogate, build_world
+from mi_nerfattack.scenes import bundled
+from mi_nerfattack.vehicle.dynamics import to_state
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -75,13 +77,9 @@ def load(tmp_path):
 
 def test_keys_and_xml_describe_the_same_sensor(load):
     state = to_state(np.array([[0.0, 0.2, 0.1]]))
-    images = []
-    for changes in ({}, NAMED):
-        sensor = build_surrogate(load(changes))
-        seen = sensor.observe(state, 0)
-        images.append(seen.image.numpy())
-    assert np.abs(images[0] - images[1]).max() < 1e-4
-    assert images[0].std() > 0.01
+    sensors = [build_surrogate(load(changes)) for changes in ({}, NAMED)]
+    one, other = (sensor.observe(state, 0).image.numpy() for sensor in sensors)
+    assert np.abs(one - other).max() < 1e-4 and one.std() > 0.01
 
 
 def test_files_of_the_scene_are_part_of_the_identity(load, tmp_path):
@@ -97,26 +95,16 @@ def test_files_of_the_scene_are_part_of_the_identity(load, tmp_path):
         raw = path.read_bytes()
         path.write_bytes(raw + b" ")
         after = scenario.identity()
-        assert {k for k in before if before[k] != after[k]} == {
-            "scenario.scene.surrogate"
-        }
+        (changed,) = {key for key in before if before[key] != after[key]}
+        assert changed == "scenario.scene.surrogate"
         path.write_bytes(raw)
 
 
-@pytest.mark.parametrize(
-    ("changes", "add", "message"),
-    [
-        ({FIELD: "[scene]"}, "", r"3: scene.field: is missing; give it, or surrogate"),
-        ({FIELD: FIELD + '\nsurrogate = "surrogate.xml"'}, "", r"4: scene.field: "),
-        ({OBJECT: ""}, "", r"8: objects.0.field: is missing"),
-        ({FIELD: NAMED[FIELD], OBJECT: ""}, "", r"10: objects.0.position_m: .*out"),
-        (NAMED, "[camera]\nwidth = 96\n", "camera.width: surrogate.xml says it; leave"),
-        (NAMED, "[camera]\nk1 = -0.01\n", "camera.k1: surrogate.xml says it; leave"),
-    ],
-)
-def test_what_the_xml_says_is_said_once(load, changes, add, message):
-    with pytest.raises(InputError, match=message):
-        load(changes, add=add)
+@pytest.mark.parametrize("lines", ["width = 96", "k1 = -0.01"])
+def test_what_the_xml_says_is_said_once(load, lines):
+    key = f"camera.{lines.partition(' ')[0]}"
+    with pytest.raises(InputError, match=f"{key}: surrogate.xml says it; leave"):
+        load(add=f"[camera]\n{lines}\n")
 
 
 def test_attached_with_surfaces_is_refused_before_the_first_drive(load):
@@ -141,16 +129,81 @@ def test_attack_writes_its_run_folder(load, tmp_path):
     """With a wall before the object; the texture moves, layers are there."""
     from mi_nerfattack.experiment.job import Job
 
-    fewer = {
-        "max_iterations = 30": "max_iterations = 1",
-        "textures = 4": "textures = 1",
-    }
+    fewer = {"iterations = 30": "iterations = 1", "textures = 4": "textures = 1"}
     scenario = load({**NAMED, **fewer}, more=WALL)
     text = (tmp_path / "scenario.toml").read_text()
     output = tmp_path / "run"
     Job(scenario, text, scenario.policy.build(), output).run()
-    document = json.loads((output / "metrics.json").read_text())
-    validate(document)
+    validate(files.read_json(output / "metrics.json"))
     layers, _ = read_layers(output / "frames/surrogate_attack/0000.exr")
     assert {"", "Z", "scene", "scene.Z", "object", "object.Z"} <= set(layers)
     assert (output / "objects/ball.safetensors").is_file()
+
+
+@pytest.fixture
+def build(tmp_path):
+    """Build the tiny scenario, with other keys of its drives."""
+
+    def inner(keys):
+        folder = write_scenario(tmp_path, {"horizon = 2\nruns = 2\n": keys})
+        path = folder / "scenario.toml"
+        path.write_text(path.read_text().replace("[attack]", "[attack]\nposes = 3"))
+        scenario, _ = load_scenario(path)
+        return build_world(scenario, scenario.policy.build())
+
+    return inner
+
+
+def test_evaluation_starts_where_no_optimisation_does(build):
+    world = build("runs = 40\nstart_m = 71.0\n")
+    attack = build_attack(world)
+    mine = np.array(attack.initial).T[:, :3]
+    nominal = [51.0, 0.0, 0.0]  # of a line from x = -20 to 60
+    np.testing.assert_allclose(mine[0], nominal, atol=1e-5)
+    apart = np.abs(world.initial[:, None] - mine[None]).max(axis=-1)
+    assert apart.min() > 1e-6
+    np.testing.assert_allclose(world.initial.mean(axis=0), nominal, atol=0.08)
+    assert world.horizon == attack.rollout.horizon == 18  # 9 m to the end of the line
+
+
+def test_start_beyond_the_route_is_refused(build):
+    with pytest.raises(InputError, match=r"start_m: 80 m; route 'line' is 80.0 m long"):
+        build("start_m = 80\n")
+
+
+SIZE = {"width": 100, "height": 33}
+
+
+def scenario():
+    """Return the demo's, of a small image with samples in the middle of intervals."""
+    found, _ = load_scenario(bundled("demo.toml"))
+    camera = found.camera.model_copy(update=SIZE)
+    attack = found.attack.model_copy(update={"jitter": False})
+    return found.model_copy(update={"camera": camera, "attack": attack})
+
+
+def test_the_scenario_drives_in_the_scene_that_the_file_shows():
+    """Image and gradient through the loop's camera, and the image of `mi.render`."""
+    world = build_world(scenario(), None)
+    scene = mi.load_file(str(bundled("demo.xml")), parallel=False, **SIZE)
+    start = world.route.pose_at(0.0)
+    sensor = SceneSensor(scene, world.place.mount, ["fields.hydrant.colour"])
+    linear = mi.render(scene, spp=1).numpy()
+    near = to_state(np.array([world.route.pose_at(16.0)]))
+    weight = None
+    found = []
+    for one in (world.surrogate, sensor):
+        seen = one.observe(to_state(start[None]), 0).linear.numpy().T
+        error = seen.reshape(linear.shape) - linear
+        assert np.sqrt((error**2).mean()) < 1e-5
+        image = one.observe(near, 0)
+        if weight is None:
+            shape, rng = image.image.shape, np.random.default_rng(0)
+            weight = mi.TensorXf(rng.normal(size=shape).astype(np.float32))
+        one.start_gradient()
+        one.vjp(image, near, weight, False)
+        found.append(one.texture_gradients()[0].numpy().copy())
+        one.stop_gradient()
+    (expected, other), size = found, np.abs(found[0]).sum()
+    assert size > 1
+    assert np.abs(other - expected).sum() < 1e-3 * size

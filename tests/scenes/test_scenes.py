@@ -1,29 +1,32 @@
-"""Bundled data: checksums, reproducible builds, geometry of routes and hydrant."""
+"""Bundled data: checksums, budgets, and builds that give what is bundled."""
 
 from __future__ import annotations
 
-import json
+import math
 import re
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from support.faults.refusals import refusals
 
 import mi_nerfattack
 from mi_nerfattack import plugins, scenes
-from mi_nerfattack.errors import InputError
+from mi_nerfattack.deploy.car import SMALL_CAR
+from mi_nerfattack.deploy.place import bundled_place
+from mi_nerfattack.io import files
+from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.scenes import bundled, manifest
 from mi_nerfattack.scenes.car import build as car
 from mi_nerfattack.scenes.hydrant import build as hydrant
 from mi_nerfattack.scenes.intersection import build as intersection
-from mi_nerfattack.scenes.intersection import layout, paint
-
-
-def route(name: str) -> np.ndarray:
-    data = json.loads(bundled("intersection/routes.json").read_text())
-    return np.array(data[name]["points_m"])
+from mi_nerfattack.scenes.intersection import layout
+from mi_nerfattack.scenes.room import build
+from mi_nerfattack.scenes.room import layout as loop
+from mi_nerfattack.training.record import read_record
+from mi_nerfattack.vehicle.route.route import Route
 
 
 def test_manifest_matches() -> None:
@@ -38,102 +41,72 @@ def test_manifest_reports_each_kind_of_difference(tmp_path) -> None:
     (tmp_path / "longer.bin").write_bytes(b"abcd")
     (tmp_path / "missing.bin").unlink()
     (tmp_path / "extra.bin").write_bytes(b"")
-    assert manifest.problems(tmp_path) == [
-        "missing.bin: missing",
-        "extra.bin: not listed",
-        "changed.bin: SHA-256 differs from the manifest's",
-        "longer.bin: 4 bytes; the manifest says 3",
-    ]
+    found = [problem.partition(": ")[0] for problem in manifest.problems(tmp_path)]
+    assert found == ["missing.bin", "extra.bin", "changed.bin", "longer.bin"]
+
+
+test_refused = refusals(
+    (lambda at: manifest.record([at / "no"], "make", None, ""), "not a file below"),
+    (lambda: bundled("nothing.xml"), r"intersection/scene\.xml"),
+    (lambda: bundled("../pyproject.toml"), r"intersection/scene\.xml"),
+)
 
 
 def test_budget_of_the_wheel_is_kept_and_told() -> None:
     text = bundled("README.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `?([\w/. ]+?)`? \| ([\d.]+) \|$", text, re.MULTILINE)
     assert {name: float(mb) for name, mb in rows} == manifest.BUDGET_MB
-    assert sum(manifest.BUDGET_MB.values()) == 45
     folders = [Path(m.__file__).parent for m in (mi_nerfattack, plugins, scenes)]
     paths = {path for folder in folders for path in folder.rglob("*")}
     code = [path for path in paths if path.suffix in (".py", ".pyi", ".j2", ".md")]
     assert len(code) > 100
     assert sum(path.stat().st_size for path in code) < 1e6 * manifest.BUDGET_MB["code"]
+    sizes = {"car/field.safetensors": 10_000_001, "a": 3_000_000, "b": 300_001}
+    over = manifest.over_budget(sizes | {"cube/field.safetensors": 4_000_000})
+    names = [line.partition(":")[0] for line in over]
+    assert names == ["car/field.safetensors", "other data"]
 
 
-def test_files_over_their_budget_are_named() -> None:
-    sizes = {"car/field.safetensors": 10_000_001, "a": 3_000_000, "b": 500_001}
-    assert manifest.over_budget(sizes | {"cube/field.safetensors": 4_000_000}) == [
-        "car/field.safetensors: 10000001 bytes; the budget is 10 million",
-        "other data: 3500001 bytes; the budget is 3.5 million",
-    ]
-
-
-def test_recording_a_file_elsewhere_is_refused(tmp_path) -> None:
-    with pytest.raises(InputError, match="not a file below"):
-        manifest.record([tmp_path / "no"], "make", None, "")
-
-
-@pytest.mark.parametrize("name", ["nothing.xml", "../pyproject.toml"])
-def test_unknown_name_lists_what_exists(name: str) -> None:
-    with pytest.raises(InputError, match=r"intersection/scene\.xml"):
-        bundled(name)
-
-
-@pytest.mark.slow
-def test_intersection_builds_to_identical_bytes(tmp_path) -> None:
-    first = intersection.build(tmp_path / "a", seed=3)
-    second = intersection.build(tmp_path / "b", seed=3)
-    assert [p.read_bytes() for p in first] == [p.read_bytes() for p in second]
-
-
-def test_seed_changes_the_road() -> None:
-    x, y = paint.pixel_grid(-5, 5, -3, 3, 2)
-    one, two = paint.road_colour(x, y, 3), paint.road_colour(x, y, 4)
-    assert np.abs(one - two).max() > 0.01
-    np.testing.assert_array_equal(one, paint.road_colour(x, y, 3))
-
-
-@pytest.mark.parametrize("build", [hydrant.build, car.build])
-def test_objects_build_to_identical_bytes(build, tmp_path) -> None:
-    build(tmp_path / "a.glb")
-    build(tmp_path / "b.glb")
-    assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "b.glb").read_bytes()
-
-
-@pytest.mark.parametrize("name", ["straight", "right", "left"])
-def test_route_is_evenly_spaced_and_smooth(name: str) -> None:
-    points = route(name)
-    step = np.diff(points, axis=0)
-    length = np.linalg.norm(step, axis=1)
-    # A chord of an arc of radius r >= 6.75 is shorter than 0.5 by at most 0.5^3/24/r^2.
-    assert np.all((length > 0.5 - 0.5**3 / 24 / 6.75**2 - 2e-6) & (length < 0.5 + 2e-6))
-    assert length.sum() >= 42
-    heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
-    # Between chords an arc of radius r turns by at most 0.5/r.
-    assert np.abs(np.diff(heading)).max() <= 0.5 / 6.75 + 1e-5
+@pytest.mark.parametrize(
+    ("name", "script", "extent"),
+    [("hydrant", hydrant, (0.38, 0.42, 0.75)), ("car", car, (4.2, 1.8, 1.45))],
+)
+def test_objects_are_metric_closed_and_as_their_scripts(
+    name, script, extent, tmp_path
+) -> None:
+    world = script.world_mesh()
+    np.testing.assert_allclose(world.extents, extent, atol=0.01)
+    assert world.bounds[0, 2] == pytest.approx(0, abs=1e-9)
+    for part, _ in script.parts():
+        assert part.is_watertight and part.volume > 0
+    script.build(tmp_path / "a.glb")
+    paths = bundled(f"{name}/{name}.glb"), tmp_path / "a.glb"
+    kept, built = (trimesh.load(path, force="mesh") for path in paths)
+    np.testing.assert_allclose(kept.vertices, built.vertices, atol=1e-6)
+    np.testing.assert_array_equal(kept.faces, built.faces)
+    colours = [mesh.visual.vertex_colors for mesh in (kept, built)]
+    np.testing.assert_array_equal(*colours)
+    x, y, z = np.asarray(kept.vertices).T  # glTF's y up to z up
+    np.testing.assert_allclose(np.c_[x, -z, y], world.vertices, atol=1e-6)
 
 
 def test_routes_lie_on_the_lane_centres() -> None:
-    x, y = route("straight").T
-    np.testing.assert_allclose(y, -1.75, atol=1e-6)
-    assert (x[0], x[-1]) == (-25, 35)
-
-    x, y = route("right").T
-    assert (x[0], y[0]) == (-22, -1.75)
-    assert abs(y[-1] + 30) < 0.5
-    east, south = x <= -8.5, y <= -8.5
-    np.testing.assert_allclose(y[east], -1.75, atol=1e-6)
-    np.testing.assert_allclose(x[south], -1.75, atol=1e-6)
-    arc = ~east & ~south
-    radius = np.hypot(x[arc] + 8.5, y[arc] + 8.5)
-    np.testing.assert_allclose(radius, 6.75, atol=2e-6)
-
-    x, y = route("left").T
-    assert (x[0], y[0]) == (1.75, -24)
-    assert abs(x[-1] + 30) < 0.5
-    north, west = y <= -7.25, x <= -7.25
-    np.testing.assert_allclose(x[north], 1.75, atol=1e-6)
-    np.testing.assert_allclose(y[west], 1.75, atol=1e-6)
-    arc = ~north & ~west
-    np.testing.assert_allclose(np.hypot(x[arc] + 7.25, y[arc] + 7.25), 9.0, atol=2e-6)
+    kept = files.read_json(bundled("intersection/routes.json"))
+    check_routes(layout.routes(), kept)
+    for name, entry in layout.routes().items():
+        points = np.array(entry["points_m"])
+        x, y = points.T
+        length = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        # a chord of an arc of radius r is shorter by at most 0.5^3 / 24 / r^2
+        np.testing.assert_allclose(length, 0.5, atol=0.5**3 / 24 / 6.75**2 + 2e-6)
+        if name == "straight":
+            np.testing.assert_allclose(y, -1.75, atol=1e-6)
+            continue
+        # a turn, mirrored at the diagonal if it is to the left: two lines and an arc
+        x, y = (y, x) if name == "left" else (x, y)
+        side, radius = (1.75, 9.0) if name == "left" else (-1.75, 6.75)
+        a, b = (np.maximum(values - side + radius, 0) for values in (x, y))
+        np.testing.assert_allclose(np.hypot(a, b), radius, atol=2e-6)
 
 
 @pytest.mark.parametrize(
@@ -141,10 +114,8 @@ def test_routes_lie_on_the_lane_centres() -> None:
     [
         (0.0, 0.0, 3.5),
         (-20.0, -1.75, 1.75),
-        (20.0, 3.0, 0.5),
         (1.75, -30.0, 1.75),
         (-8.5, -3.5, 0.0),
-        (3.5, -8.5, 0.0),
         (8.5 - 5 / 2**0.5, -8.5 + 5 / 2**0.5, 0.0),
         (-30.0, 5.0, -1.5),
         (6.0, -20.0, -2.5),
@@ -155,73 +126,116 @@ def test_distance_to_the_kerb(x: float, y: float, expected: float) -> None:
     np.testing.assert_allclose(depth, expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["straight", "right", "left"])
-def test_a_car_on_the_route_stays_off_the_kerbs(name: str) -> None:
-    x, y = route(name).T
-    assert layout.road_depth(x, y).min() >= 1.75 - 1e-5
+FILES = manifest.load()
+#: Policies by name: where they were trained, and objects of other folders.
+POLICIES = {
+    "policy/pilotnet": ("intersection", {"car", "cube", "hydrant"}),
+    "room/policy": ("room", {"cube"}),
+}
 
 
-def test_scene_loads_and_is_exposed(variant: str) -> None:
-    scene = mi.load_file(str(bundled("intersection/scene.xml")), width=48, height=32)
-    image = np.array(mi.render(scene, spp=16, seed=0))[..., :3]
-    assert image.shape == (32, 48, 3)
-    assert np.all(np.isfinite(image))
-    assert 0.05 < image.mean() < 0.5
-    assert np.mean(image.max(axis=-1) > 1) < 0.02
-    assert np.mean(image.max(axis=-1) < 0.01) < 0.02
+@pytest.mark.parametrize("name", POLICIES)
+def test_policy_record_and_card_tell_one_story(name: str) -> None:
+    record = read_record(bundled(f"{name}.json"))
+    assert record is not None
+    card = files.read_json(bundled(f"{name}.card.json"))
+    policy, (place, objects) = f"{name}.safetensors", POLICIES[name]
+    assert card["policy_section"]["file_sha256"] == FILES[policy]["sha256"]
+    assert card["training"]["command"] == record.command
+    trained = record.command, record.seed
+    measured = card["command"], card["settings"]["seed"]
+    suffixes = {".safetensors": trained, ".json": trained}
+    suffixes |= {".card.json": measured, ".png": measured}
+    for suffix, expected in suffixes.items():
+        entry = FILES[f"{name}{suffix}"]
+        assert (entry["command"], entry["seed"]) == expected
+    sums = {file.removeprefix(f"{place}/"): FILES[file]["sha256"] for file in FILES}
+    for file, digest in record.checksums.items():
+        assert sums[file.removeprefix(f"{place}/")] == digest, file
+    folders = {file.partition("/")[0] for file in record.checksums}
+    assert folders & {"car", "cube", "hydrant"} == objects
+    found = {file.partition("/")[0] for file in card["place"]}
+    assert found >= objects - {"hydrant"}
 
 
-def test_markings_are_where_the_lanes_are(variant: str) -> None:
-    """Look straight down: paint is brighter than the asphalt beside it."""
-    scene = mi.load_file(str(bundled("intersection/scene.xml")))
+STRAIGHT = 2 * (loop.TRACK_HALF - loop.CORNER_RADIUS)
+LENGTH = 4 * STRAIGHT + 2 * math.pi * loop.CORNER_RADIUS
+#: By which 70 chords of an arc of radius r are shorter: s^3 / 24 / r^2 each.
+CHORDS = 70 * 0.1**3 / 24 / loop.CORNER_RADIUS**2
 
-    def colour(x: float, y: float) -> float:
-        ray = mi.Ray3f(mi.Point3f(x, y, 3.0), mi.Vector3f(0, 0, -1))
-        si = scene.ray_intersect(ray)
-        np.testing.assert_allclose(np.array(si.p.z), 0.0, atol=1e-5)
-        return float(np.mean(np.array(si.bsdf(ray).eval_diffuse_reflectance(si))))
 
-    for line, asphalt in (
-        ((-30.0, 3.15), (-30.0, 2.6)),  # north edge line
-        ((11.5, 0.0), (14.5, 0.0)),  # centre dash and gap
-        ((0.0, -17.0), (0.0, -20.0)),  # the same on the side road
-        ((1.5, -14.1), (-1.5, -14.1)),  # stop line of the northbound lane
-        ((0.5, -11.5), (0.0, -11.5)),  # crosswalk
-    ):
-        assert colour(*line) > 2.5 * colour(*asphalt)
+def check_routes(one: dict, two: dict) -> None:
+    """Check that routes are equal, but for the rounding of their points."""
+    for table in (one, two):
+        points = [np.array(route.pop("points_m")) for route in table.values()]
+        table["points"] = np.concatenate(points)
+    np.testing.assert_allclose(one.pop("points"), two.pop("points"), atol=2e-6)
+    assert one == two
 
 
 @pytest.mark.parametrize(
-    ("name", "script", "extent"),
-    [("hydrant", hydrant, (0.38, 0.42, 0.75)), ("car", car, (4.2, 1.8, 1.45))],
+    ("place", "make", "seed"),
+    [
+        ("room", build.build, 5),
+        pytest.param("intersection", intersection.build, 3, marks=pytest.mark.slow),
+    ],
 )
-def test_objects_are_metric_closed_and_as_their_scripts(name, script, extent) -> None:
-    world = script.world_mesh()
-    np.testing.assert_allclose(world.extents, extent, atol=0.01)
-    assert world.bounds[0, 2] == pytest.approx(0, abs=1e-9)
-    for part, _ in script.parts():
-        assert part.is_watertight and part.volume > 0
-    file = bundled(f"{name}/{name}.glb")
-    loaded = trimesh.load(file, force="mesh")
-    x, y, z = np.asarray(loaded.vertices).T
-    back = np.stack([x, -z, y], axis=1)  # glTF's y up to z up
-    np.testing.assert_allclose(back, world.vertices, atol=1e-6)
-    assert file.stat().st_size < 300_000
+def test_builds_to_what_is_bundled(tmp_path, place, make, seed) -> None:
+    """Not to the bytes: zlib's depend on its version, a sine's on the processor."""
+    for path in make(tmp_path, seed=seed):
+        kept = bundled(f"{place}/{path.relative_to(tmp_path).as_posix()}")
+        if path.suffix == ".png":
+            one, two = (files.read_image(item).astype(int) for item in (path, kept))
+            assert np.abs(one - two).max() <= 1
+        elif path.suffix == ".ply":
+            one, two = (trimesh.load_mesh(item, process=False) for item in (path, kept))
+            np.testing.assert_allclose(one.vertices, two.vertices, atol=1e-6)
+            np.testing.assert_array_equal(one.faces, two.faces)
+        elif path.suffix == ".json":
+            check_routes(*(files.read_json(item) for item in (path, kept)))
+        else:
+            assert path.read_bytes() == kept.read_bytes()
 
 
-def test_hydrant_is_upright() -> None:
-    """The flange at the foot is wider than the nut at the top."""
-    place = np.asarray(hydrant.world_mesh().vertices)
-    foot, top = place[place[:, 2] < 0.03], place[place[:, 2] > 0.74]
-    assert np.hypot(*foot.T[:2]).max() > 3 * np.hypot(*top.T[:2]).max()
+def test_the_loop_is_closed_even_and_fit_for_the_car() -> None:
+    np.testing.assert_allclose(loop.track_distance(*loop.track().T), 0, atol=1e-12)
+    route = Route.from_file(bundled("room/routes.json"), "square")
+    assert route.closed and route.length == pytest.approx(LENGTH, abs=CHORDS)
+    steps = np.linalg.norm(np.roll(route.points, -1, axis=0) - route.points, axis=1)
+    # a chord of an arc is shorter by at most s^3 / 24 / r^2
+    assert np.ptp(steps) < 0.11**3 / 24 / loop.CORNER_RADIUS**2
+    steer = math.atan(SMALL_CAR.wheelbase / loop.CORNER_RADIUS)
+    assert steer < 0.9 * SMALL_CAR.max_steer
 
 
-def test_car_stands_on_four_wheels_and_looks_along_x() -> None:
-    world = car.world_mesh()
-    place, colour = np.asarray(world.vertices), world.visual.vertex_colors
-    feet = np.sign(place[place[:, 2] < 0.02][:, :2])
-    assert len(np.unique(feet, axis=0)) == 4
-    red = (colour[:, 0] > 100) & (colour[:, 1] < 10)
-    white = colour[:, :3].min(axis=1) > 190
-    assert place[red, 0].max() < -1.9
-    assert place[white & (np.abs(place[:, 1]) > 0.4), 0].min() > 1.9
+@pytest.mark.parametrize(
+    ("x", "y", "expected"),
+    [
+        (0, -1.6, 0),
+        (0, 2, 0.4),
+        (-1.5, 0.2, -0.1),
+        (0, 0, -1.6),
+        (1.6, 1.6, math.hypot(1.1, 1.1) - 1.1),  # the corner's centre is (0.5, 0.5)
+    ],
+)
+def test_distance_to_the_loop(x, y, expected) -> None:
+    distance = loop.track_distance(np.array(float(x)), np.array(float(y)))
+    assert distance == pytest.approx(expected)
+
+
+def test_the_policy_sees_the_picture_that_it_was_trained_with() -> None:
+    """The rows that are kept, at 200x66, within half a pixel of 66 rows."""
+    scenario, place = load_scenario(bundled("room.toml"))[0], bundled_place("room")
+    assert scenario.vehicle.car().control_unit == scenario.policy.unit() == "rad"
+    camera, mount = scenario.camera.build()
+    assert (camera.width, camera.height) == (336, 188) and mount == place.mount
+    top, bottom, left, right = scenario.policy.preprocess.crop_px
+    size = camera.width - left - right, camera.height - top - bottom
+    kept = Camera(*size, camera.fx, camera.fy, camera.cx - left, camera.cy - top)
+    resize = scenario.policy.preprocess.resize_px
+    seen, wanted = kept.resized(*resize), place.camera
+    assert (seen.width, seen.height) == (wanted.width, wanted.height)
+    assert (seen.cx, seen.cy) == pytest.approx((wanted.cx, wanted.cy))
+    assert seen.fx == pytest.approx(wanted.fx)
+    # rows are squeezed by so little that the outermost moves by less than half a pixel
+    assert abs(seen.fy / wanted.fy - 1) * wanted.height / 2 < 0.5

@@ -1,17 +1,22 @@
-"""Processes that work for this one: what they import, and what memory is theirs."""
+"""Processes that work for this one, what memory is theirs, and free pages."""
 
 from __future__ import annotations
 
+import ctypes
+import mmap
 import multiprocessing
 import os
+import platform
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mi_nerfattack.system.memory import peak_memory_mb
+from mi_nerfattack.system import machine as heap
+from mi_nerfattack.system.machine import peak_memory_mb
 from mi_nerfattack.system.processes import module_command, safe_path
 
 
@@ -45,7 +50,40 @@ def test_worker_starts_by_pythons_own_modules(shadows):
 def test_a_process_does_not_inherit_the_peak_of_its_parent():
     """A child that only imports the package, of a parent that holds 800 MB more."""
     ballast = np.ones(100_000_000)
-    code = "from mi_nerfattack.system import memory; print(memory.peak_memory_mb())"
+    code = "from mi_nerfattack.system import machine; print(machine.peak_memory_mb())"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     assert 20 < float(run.stdout) < 700
     assert peak_memory_mb() > ballast.nbytes / 1e6
+
+
+# Below 128 KiB, from where glibc maps blocks; too block to fill gaps that there are.
+BLOCK, BETWEEN, COUNT = 100_000, 20_000, 1000
+
+
+def resident_bytes() -> int:
+    pages = Path("/proc/self/statm").read_text().split()[1]
+    return int(pages) * mmap.PAGESIZE
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's own function")
+def test_pages_between_small_blocks_are_released():
+    libc = ctypes.CDLL(None)
+    libc.malloc.restype = ctypes.c_void_p
+    blocks = [(libc.malloc(BLOCK), libc.malloc(BETWEEN)) for _ in range(COUNT)]
+    for block, _ in blocks:
+        ctypes.memset(block, 1, BLOCK)
+    for block, _ in blocks:
+        libc.free(ctypes.c_void_p(block))
+    before = resident_bytes()
+    assert heap.release_heap()
+    assert before - resident_bytes() > 0.8 * BLOCK * COUNT
+    for _, small in blocks:
+        libc.free(ctypes.c_void_p(small))
+
+
+@pytest.mark.parametrize("library", ["", "musl"])  # macOS and Windows; Alpine
+def test_other_libraries_are_left_alone(library, monkeypatch):
+    monkeypatch.setattr(platform, "libc_ver", lambda: (library, ""))
+    monkeypatch.setattr(ctypes, "CDLL", None)
+    monkeypatch.setattr(heap, "_trim", heap._trim.__wrapped__)  # without its cache
+    assert not heap.release_heap()

@@ -10,8 +10,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import torch
-from helpers.kernels import nothing_compiled
-from helpers.roadside import (
+from support.faults.refusals import refusals
+from support.reference.derivatives import nothing_compiled
+from support.worlds.places import (
     Grey,
     PaintedSite,
     bent,
@@ -21,14 +22,12 @@ from helpers.roadside import (
     surroundings,
 )
 
-from mi_nerfattack.deploy.place import Place
-from mi_nerfattack.deploy.scatter import Scatter
+from mi_nerfattack.deploy.place import Scatter, bundled_place
 from mi_nerfattack.deploy.sites import PlaceSite, Weather
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.policy.pilotnet import PilotNet
-from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
-from mi_nerfattack.scenes import bundled
+from mi_nerfattack.render.camera.intrinsics import from_fov
 from mi_nerfattack.system.workers import InThisProcess
 from mi_nerfattack.training.collect import collect, find_shards
 from mi_nerfattack.training.dataset import FrameDataset
@@ -43,7 +42,7 @@ from mi_nerfattack.vehicle.route.route import load_routes
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-HERE = InThisProcess()
+HERE, SOURCE, ROUTES = InThisProcess(), Scattered(), (straight(),)
 
 
 def follower(route):
@@ -53,6 +52,11 @@ def follower(route):
 @pytest.fixture
 def site() -> PaintedSite:
     return PaintedSite()
+
+
+def gather(folder, site, source=SOURCE, routes=ROUTES, **changes):
+    shards = collect(site, list(routes), source, small(**changes), folder, HERE)
+    return shards, FrameDataset.from_shards(shards)
 
 
 def states_of(site: PaintedSite) -> np.ndarray:
@@ -69,46 +73,39 @@ def conditions_of(shards: list[Path]) -> list[dict]:
 
 def test_frames_carry_the_experts_control_and_goal(site, tmp_path):
     routes = [straight(), bent()]
-    shards = collect(site, routes, Scattered(), small(frames=120), tmp_path, HERE)
-    data = FrameDataset.from_shards(shards)
+    shards, data = gather(tmp_path, site, routes=routes, frames=120)
     assert len(data) == 120
     # the last group of a shard may be cut: only what was labelled is written
     states = states_of(site)
-    assert len(states) == 120
-    assert set(data.goals) == {0, 1}
+    assert len(states) == 120 and set(data.goals) == {0, 1}
     for route in routes:
         mine = data.goals == route.goal
         expected = follower(route).control(states[mine])
         np.testing.assert_allclose(data.controls[mine], expected, rtol=1e-6)
         arc = route.project_numpy(states[mine])[0]
-        assert arc.min() > -3
-        assert arc.max() < route.length + 3
+        assert -3 < arc.min() and arc.max() < route.length + 3
     frames = data.read_frames(np.arange(120))
     levels = [about["level"] for about in conditions_of(shards) for _ in range(12)]
     expected = [painted(s, Grey(k)) for s, k in zip(states, levels, strict=True)]
     np.testing.assert_array_equal(frames[:, 2, 3], expected)
 
 
-def test_the_last_shard_has_the_rest(site, tmp_path):
-    settings = small(frames=17)
-    shards = collect(site, [straight()], Scattered(), settings, tmp_path, HERE)
-    sizes = [len(FrameDataset.from_shards([shard])) for shard in shards]
-    assert sizes == [12, 5]
-
-
 def test_conditions_change_from_shard_to_shard(site, tmp_path):
-    settings = small(frames=120)
-    shards = collect(site, [straight()], Scattered(), settings, tmp_path, HERE)
+    shards, _ = gather(tmp_path, site, frames=113, object_share=0.0)
+    sizes = [len(FrameDataset.from_shards([shard])) for shard in shards]
+    assert sizes == [12] * 9 + [5]  # the last one has the rest
     levels = [about["level"] for about in conditions_of(shards)]
     assert set(levels) == {0, 1, 2}
     # loaded only where they differ
     changes = 1 + sum(a != b for a, b in zip(levels, levels[1:], strict=False))
     assert len(site.opened) == changes
+    bare = PaintedSite(objects=False)
+    gather(tmp_path / "bare", bare, routes=[bent()])
+    assert not any(any(item.seen) for item in (*site.opened, *bare.opened))
 
 
 def test_up_to_six_objects_come_and_go_ahead_of_the_vehicles(site, tmp_path):
-    settings = small(frames=160, objects=6)
-    shards = collect(site, [straight()], Scattered(), settings, tmp_path, HERE)
+    shards, _ = gather(tmp_path, site, frames=160, objects=6)
     seen = [objects for item in site.opened for objects in item.seen]
     assert {len(objects) for objects in seen} == set(range(7))
     assert 0.55 < np.mean([bool(objects) for objects in seen]) < 0.95
@@ -136,8 +133,8 @@ class IslandSite(PaintedSite):
 
 def test_no_ground_is_wanted_beyond_a_routes_end(tmp_path):
     """Near the end objects stand before it, or there are fewer."""
-    site, settings = IslandSite(), small(frames=96, object_share=1.0)
-    collect(site, [straight()], Scattered(), settings, tmp_path, HERE)
+    site = IslandSite()
+    gather(tmp_path, site, frames=96, object_share=1.0)
     shown = [objects for item in site.opened for objects in item.seen]
     late = [o for o, s in zip(shown, states_of(site), strict=True) if s[0] > 36]
     assert late and all(late)
@@ -145,48 +142,11 @@ def test_no_ground_is_wanted_beyond_a_routes_end(tmp_path):
     assert 30 < max(ends) < 40
 
 
-def test_no_objects_when_none_are_wanted(site, tmp_path):
-    settings = small(object_share=0.0)
-    collect(site, [straight()], Scattered(), settings, tmp_path / "a", HERE)
-    bare = PaintedSite(objects=False)
-    collect(bare, [bent()], Scattered(), small(), tmp_path / "b", HERE)
-    assert not any(any(item.seen) for item in (*site.opened, *bare.opened))
-
-
-def test_interrupted_collection_continues_with_the_same_frames(site, tmp_path):
-    routes, settings = [straight(), bent()], small(frames=36)
-    whole = collect(site, routes, Scattered(), settings, tmp_path / "whole", HERE)
-    part = tmp_path / "part"
-
-    def stop(done, total):
-        if done == 20:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        collect(site, routes, Scattered(), settings, part, HERE, stop)
-    first = part / "painted" / "shard_0000.safetensors"
-    written = first.stat().st_mtime_ns
-    seen = []
-    again = collect(
-        site,
-        routes,
-        Scattered(),
-        settings,
-        part,
-        HERE,
-        lambda done, total: seen.append((done, total)),
-    )
-    assert first.stat().st_mtime_ns == written
-    assert seen == [(done, 36) for done in range(12, 37)]
-    for one, other in zip(whole, again, strict=True):
-        assert one.read_bytes() == other.read_bytes()
-
-
 def test_expert_drives_recover(site, tmp_path):
     """From 1 m beside the lane the expert comes back within 16 periods (8 m)."""
     scatter = Scatter(lateral_sd_m=0.8, heading_sd=0.01, close_share=0.0)
-    settings = small(frames=64, shard=64, scatter=scatter, object_share=0.0)
-    collect(site, [straight()], ExpertDrives(16), settings, tmp_path, HERE)
+    options = {"frames": 64, "shard": 64, "object_share": 0.0}
+    gather(tmp_path, site, ExpertDrives(16), scatter=scatter, **options)
     (environment,) = site.opened
     drives = np.split(np.stack(environment.states), environment.starts[1:])
     error = np.abs([(drive[0, 1], drive[15, 1]) for drive in drives if len(drive) > 15])
@@ -206,12 +166,9 @@ def weights(tmp_path) -> Path:
 
 def test_visited_states_are_those_of_the_policy(weights, tmp_path):
     """At a constant rate of 0.2 rad/s the vehicle drives arcs."""
-    site = PaintedSite(size_px=(200, 66))
-    settings = small(frames=12, scatter=Scatter(close_share=1.0), margin_m=-8.0)
-    drives = PolicyDrives(weights, horizon=3)
-    shards = collect(site, [straight()], drives, settings, tmp_path, HERE)
-    data = FrameDataset.from_shards(shards)
-    assert len(data) == 12
+    site, options = PaintedSite(size_px=(200, 66)), {"frames": 12, "margin_m": -8.0}
+    drives, scatter = PolicyDrives(weights, horizon=3), Scatter(close_share=1.0)
+    _, data = gather(tmp_path, site, drives, scatter=scatter, **options)
     (environment,) = site.opened
     for start in environment.starts:
         first, second = environment.states[start : start + 2]
@@ -222,12 +179,10 @@ def test_visited_states_are_those_of_the_policy(weights, tmp_path):
 
 def test_the_expert_drives_its_share_of_the_periods(weights, tmp_path):
     site = PaintedSite(size_px=(200, 66), objects=False)
-    settings = small(frames=200, shard=200)
     drives = PolicyDrives(weights, horizon=8, expert_share=0.5)
-    collect(site, [straight()], drives, settings, tmp_path, HERE)
+    gather(tmp_path, site, drives, frames=200, shard=200)
     (environment,) = site.opened
-    states = np.stack(environment.states)
-    turn = np.diff(states[:, 2])
+    turn = np.diff(np.stack(environment.states)[:, 2])
     same = np.setdiff1d(np.arange(len(turn)), np.array(environment.starts) - 1)
     assert 0.35 < np.isclose(turn[same], 0.02, atol=1e-6).mean() < 0.65
 
@@ -235,76 +190,48 @@ def test_the_expert_drives_its_share_of_the_periods(weights, tmp_path):
 def test_drives_end_where_the_vehicle_has_strayed(weights, tmp_path):
     """0.6 lane widths off, frames teach nothing any more."""
     site = PaintedSite(size_px=(200, 66), objects=False)
-    drives = PolicyDrives(weights, horizon=60)
-    shards = collect(site, [straight()], drives, small(), tmp_path, HERE)
-    frames = FrameDataset.from_shards(shards).read_frames(np.arange(24))
-    lateral = 0.2 * (frames[:, 0, 0, 1] - 128.0)
+    _, data = gather(tmp_path, site, PolicyDrives(weights, horizon=60))
+    lateral = 0.2 * (data.read_frames(np.arange(24))[:, 0, 0, 1] - 128.0)
     assert np.abs(lateral).max() < 0.6 * 3.5 + 0.5  # grey levels of 0.2 m, up to 2
     assert max(np.diff(site.opened[0].starts)) < 60
 
 
 def test_a_mixture_takes_from_all_its_sources(site, tmp_path):
     mixture = Mixture((Scattered(), ExpertDrives(3)), (0.5, 0.5))
-    settings = small(frames=240, shard=240)
-    collect(site, [straight()], mixture, settings, tmp_path, HERE)
+    gather(tmp_path, site, mixture, frames=240, shard=240)
     lengths = np.diff(site.opened[0].starts)
     assert {1, 3} <= set(lengths) <= {1, 2, 3}  # 2: past the route's end
-    with pytest.raises(InputError, match="one positive share a source"):
-        Mixture((Scattered(),), (0.5, 0.5))
 
 
-def test_folder_of_other_settings_is_refused(site, weights, tmp_path):
-    routes = [straight()]
-
-    def again(site=site, routes=routes, source=Scattered(), **changes):  # noqa: B008
-        collect(site, routes, source, small(**changes), tmp_path, HERE)
-
-    again()
-    with pytest.raises(InputError, match=r"shard_0000.*\n  settings.seed: \d+ -> 6\n"):
-        again(seed=6)
-    with pytest.raises(InputError, match=r"  routes: (.*\n)+  expert"):
-        again(routes=[bent()])
-    with pytest.raises(InputError, match=r"here\)\n  routes: .*\nchoose"):
-        # where drives end
-        again(routes=[dataclasses.replace(straight(), lane_width_m=3.0)])
-    with pytest.raises(InputError, match=r"here\)\n  site"):
-        again(site=PaintedSite(size_px=(4, 4)))
-    with pytest.raises(InputError, match=r"here\)\n  source"):
-        again(source=PolicyDrives(weights))
-    # a shard is enough, whichever it is
-    (tmp_path / "painted" / "shard_0000.safetensors").unlink()
-    with pytest.raises(InputError, match="shard_0001"):
-        again(seed=6)
+test_refused = refusals(
+    (lambda: Mixture((Scattered(),), (0.5, 0.5)), "one positive share a source"),
+    (lambda: Weather(("day",), (0.0, float("nan"))), "exposure_ev: nan"),
+    (lambda: Weather(("dusk",)), "sky: 'dusk'"),
+    (lambda: bundled_site("moon"), "environment: 'moon'; one of surrogate"),
+    (find_shards, "no frames"),
+)
 
 
-def test_exposures_of_the_weather_are_checked():
-    with pytest.raises(InputError, match="exposure_ev: nan; must be a finite number"):
-        Weather(("day",), (0.0, float("nan")))
-
-
-def test_folders_without_frames_are_named(tmp_path):
-    with pytest.raises(InputError, match="no frames in it"):
-        find_shards(tmp_path)
-
-
-def test_a_full_disk_is_told(site, tmp_path, monkeypatch):
-    def full(*arguments):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.write", full)
-    with pytest.raises(InputError, match="no space left on the disk"):
-        collect(site, [straight()], Scattered(), small(), tmp_path, HERE)
+@pytest.mark.parametrize(
+    ("key", "changes"),
+    [
+        ("settings.seed: [0-9]+ -> 6", {"seed": 6}),
+        ("routes", {"routes": [bent()]}),
+        ("routes", {"routes": [dataclasses.replace(straight(), lane_width_m=3.0)]}),
+        ("site", {"site": PaintedSite(size_px=(4, 4))}),
+        ("source", {"source": ExpertDrives(3)}),
+    ],
+)
+def test_folder_of_other_settings_is_refused(tmp_path, key, changes):
+    """A shard is enough, whichever it is."""
+    gather(tmp_path, PaintedSite())[0][0].unlink()
+    with pytest.raises(InputError, match=rf"shard_0001.*\n(.*\n)*  {key}"):
+        gather(tmp_path, **{"site": PaintedSite(), **changes})
 
 
 def bundled_site(name: str, **changes) -> PlaceSite:
-    place = Place(
-        bundled("intersection/scene.xml"),
-        bundled("intersection/field.safetensors"),
-        bundled("intersection/routes.json"),
-        (bundled("hydrant/field.safetensors"),),
-        from_fov(24, 8, 90.0),
-        CameraMount(),
-    )
+    place = bundled_place("intersection")
+    place = dataclasses.replace(place, camera=from_fov(24, 8, 90.0))
     return PlaceSite(name, place, Weather(spp=1, **changes))
 
 
@@ -313,28 +240,18 @@ def bundled_site(name: str, **changes) -> PlaceSite:
 )
 def test_nothing_is_compiled_after_the_first_shard(name, tmp_path):
     site = bundled_site(name)
-    routes = load_routes(site.place.routes)
-    settings = small(frames=24, shard=24)
-    collect(site, routes, Scattered(), settings, tmp_path / "warm", HERE)
+    options = {"routes": load_routes(site.place.routes), "frames": 24, "shard": 24}
+    gather(tmp_path / "warm", site, **options)
     with nothing_compiled():
-        collect(site, routes, Scattered(), settings, tmp_path / "again", HERE)
+        gather(tmp_path / "again", site, **options)
 
 
 def test_shards_of_a_place_have_their_light(tmp_path):
     site = bundled_site("mitsuba", skies=("noon",), exposures_ev=(-2.0, 2.0))
-    routes = load_routes(site.place.routes)
-    settings = small(frames=24, shard=4, object_share=0.0)
-    shards = collect(site, routes, Scattered(), settings, tmp_path, HERE)
-    means: dict[float, list[float]] = {}
-    for shard, about in zip(shards, conditions_of(shards), strict=True):
-        frames = FrameDataset.from_shards([shard]).read_frames(np.arange(4))
-        means.setdefault(about["exposure_ev"], []).append(frames.mean())
-    assert set(means) == {-2.0, 2.0}
+    options = {"routes": load_routes(site.place.routes), "object_share": 0.0}
+    shards, data = gather(tmp_path, site, frames=24, shard=4, **options)
+    means: dict[float, list[float]] = {-2.0: [], 2.0: []}
+    for number, about in enumerate(conditions_of(shards)):
+        frames = data.read_frames(np.arange(4) + 4 * number)
+        means[about["exposure_ev"]].append(frames.mean())
     assert max(means[-2.0]) < min(means[2.0]) - 30
-
-
-def test_unknown_environments_and_skies_are_refused():
-    with pytest.raises(InputError, match=r"environment: 'moon'; one of surrogate"):
-        bundled_site("moon")
-    with pytest.raises(InputError, match="sky: 'dusk'"):
-        Weather(("dusk",))

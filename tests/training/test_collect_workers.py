@@ -1,4 +1,4 @@
-"""Collection by several processes, killed and continued."""
+"""Work by several processes: killed, dead and interrupted ones."""
 
 from __future__ import annotations
 
@@ -12,104 +12,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from helpers.roadside import PaintedSite, bent, small, straight
+from support.faults.refusals import refusals
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.system import workers
-from mi_nerfattack.system.workers import AbstractWork, InThisProcess, Processes
-from mi_nerfattack.training.collect import collect
-from mi_nerfattack.training.settings import CollectSettings
-from mi_nerfattack.training.sources import AbstractSource, Scattered
-
-pytestmark = pytest.mark.usefixtures("variant")
+from mi_nerfattack.system.workers import AbstractWork, Processes
 
 SCRIPT = """
-import mi_nerfattack
-from pathlib import Path
-from tests.training.test_collect_workers import Stopping, settings
-from helpers.roadside import PaintedSite, bent, straight
-from mi_nerfattack.training.collect import collect
-from mi_nerfattack.system.workers import Processes
-
-if __name__ == "__main__":
-    folder, routes = Path({folder!r}), [straight(), bent()]
-    collect(PaintedSite(), routes, Stopping(folder), settings(), folder, Processes(2))
-"""
-
-
-def settings() -> CollectSettings:
-    return small(frames=96)
-
-
-def shards(folder: Path) -> list[Path]:
-    return list(folder.rglob("shard_*.safetensors"))
-
-
-@dataclass(frozen=True)
-class Stopping(AbstractSource):
-    """Scattered states; with three shards there, a process waits before its next frame.
-
-    It says so by a file of its own beside the folder, and goes on once there is `go`.
-    """
-
-    folder: Path
-
-    def prepare(self):
-        return Scattered().prepare()
-
-    def frames(self, prepared, scenery):
-        for labelled in Scattered().frames(prepared, scenery):
-            if len(shards(self.folder)) >= 3:
-                (self.folder.parent / f"waiting_{os.getpid()}").touch()
-                while not (self.folder.parent / "go").exists():
-                    time.sleep(0.01)
-            yield labelled
-
-    def describe(self):
-        return Scattered().describe()
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
-
-
-def is_alive(pid: int) -> bool:
-    status = Path(f"/proc/{pid}/stat")
-    return status.exists() and status.read_text().rpartition(")")[2].split()[0] != "Z"
-
-
-@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
-def test_killed_collection_continues_without_gaps_or_duplicates(tmp_path):
-    routes = [straight(), bent()]
-    whole, part = tmp_path / "whole", tmp_path / "part"
-    collect(PaintedSite(), routes, Scattered(), settings(), whole, InThisProcess())
-    script = tmp_path / "run.py"
-    script.write_text(SCRIPT.format(folder=str(part)))
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    process = subprocess.Popen([sys.executable, str(script)], env=environment)
-    deadline = time.monotonic() + 120
-    while len(waiting := list(tmp_path.glob("waiting_*"))) < 2:
-        assert time.monotonic() < deadline and process.poll() is None
-        time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    (tmp_path / "go").touch()
-    pids = [int(path.name.removeprefix("waiting_")) for path in waiting]
-    while any(is_alive(pid) for pid in pids):  # they notice that it has gone
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    assert len(shards(part)) in (3, 4)  # the other process may end its shard
-    collect(PaintedSite(), routes, Scattered(), settings(), part, InThisProcess())
-    assert contents(part) == contents(whole)
-
-
-STARTING = """
-if __name__ == "__mp_main__":  # what a process imports before it works
-    import pathlib, time
+import pathlib, time
+if __name__ == "__mp_main__" and {starting}:  # what a process imports before it works
     pathlib.Path("started").touch()
     time.sleep(60)
 
@@ -118,45 +29,29 @@ from mi_nerfattack.system.workers import Processes
 
 if __name__ == "__main__":
     try:
-        Processes(2).run(Piece(None), range(2), print)
+        Processes(2).run(Piece(None, waits=True), range(2), print)
     except KeyboardInterrupt:
         print("interrupted")
 """
-
-
-@pytest.mark.skipif(os.name == "nt", reason="needs process groups")
-def test_ctrl_c_while_workers_start_is_told_once(tmp_path):
-    """A terminal sends it to all processes."""
-    (tmp_path / "run.py").write_text(STARTING)
-    process = subprocess.Popen(
-        [sys.executable, "run.py"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    deadline = time.monotonic() + 300
-    while not (tmp_path / "started").exists() and process.poll() is None:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    time.sleep(0.2)
-    os.killpg(process.pid, signal.SIGINT)
-    assert process.communicate(timeout=30) == ("interrupted\n", "")
+PIPES = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
 
 
 @dataclass(frozen=True)
 class Piece(AbstractWork):
-    """Ends its process at piece 2, or raises there."""
+    """Ends its process at piece 2, or raises there; or waits, and says so by a file."""
 
     code: int | None
+    waits: bool = False
 
     def open(self):
         return self.code
 
     def do(self, opened, index, report):
         report(1)
+        if self.waits:
+            Path(f"started_{os.getpid()}").touch()
+            while not Path("go").exists():
+                time.sleep(0.01)
         if index == 2 and opened is not None:
             os.kill(os.getpid(), opened)
         if index == 2:
@@ -166,31 +61,72 @@ class Piece(AbstractWork):
         pass
 
 
-def test_a_dead_worker_is_told_in_a_line_and_leaves_no_other(capfd):
-    with pytest.raises(
-        InputError, match=r"ended by signal 9 in piece 2; it may"
-    ) as end:
-        Processes(2).run(Piece(signal.SIGKILL), range(8), lambda units: None)
+def started(folder: Path, starting: bool, count: int) -> subprocess.Popen:
+    """Run the script until so many of its processes have begun."""
+    (folder / "run.py").write_text(SCRIPT.format(starting=starting))
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "run.py"]
+    process = subprocess.Popen(
+        command, cwd=folder, env=environment, start_new_session=True, **PIPES
+    )
+    deadline = time.monotonic() + 300
+    while len(list(folder.glob("started*"))) < count and process.poll() is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    return process
+
+
+def is_alive(pid: int) -> bool:
+    status = Path(f"/proc/{pid}/stat")
+    return status.exists() and status.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
+def test_workers_of_a_killed_process_end(tmp_path):
+    process = started(tmp_path, starting=False, count=2)
+    process.kill()
+    (tmp_path / "go").touch()
+    process.communicate(timeout=30)
+    pids = [int(path.name.partition("_")[2]) for path in tmp_path.glob("started_*")]
+    deadline = time.monotonic() + 30
+    assert len(pids) == 2
+    while any(is_alive(pid) for pid in pids):  # they notice that it has gone
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs process groups")
+def test_ctrl_c_while_workers_start_is_told_once(tmp_path):
+    """A terminal sends it to all processes."""
+    process = started(tmp_path, starting=True, count=1)
+    time.sleep(0.2)
+    os.killpg(process.pid, signal.SIGINT)
+    assert process.communicate(timeout=30) == ("interrupted\n", "")
+
+
+@pytest.mark.parametrize(
+    ("code", "count", "message"),
+    [(signal.SIGKILL, 2, "signal 9 in piece 2"), (None, 1, "piece two: is wrong")],
+)
+def test_a_dead_worker_is_told_in_a_line_and_leaves_no_other(
+    code, count, message, capfd
+):
+    with pytest.raises(InputError, match=message) as end:
+        Processes(count).run(Piece(code), range(8), lambda units: None)
     assert "\n" not in str(end.value) and capfd.readouterr() == ("", "")
     assert not multiprocessing.active_children()
-
-
-def test_an_error_in_a_worker_is_the_callers():
-    with pytest.raises(InputError, match="piece two: is wrong"):
-        Processes(1).run(Piece(None), range(8), lambda units: None)
 
 
 def test_too_little_memory_of_a_worker_is_told_in_a_line():
     told = workers._failed(MemoryError("249 TiB"))  # by the worker
     error = workers.failure(2, told)
     assert isinstance(error, InputError) and "\n" not in str(error)
-    assert "not enough memory: 249 TiB; use fewer workers" in str(error)
+    assert "249 TiB" in str(error) and "workers" in error.remedy
 
 
-@pytest.mark.parametrize("count", [0, 1000, 1.5])
-def test_number_of_workers_is_checked(count):
-    with pytest.raises(InputError, match="workers"):
-        Processes(count)
+test_number_of_workers_is_checked = refusals(
+    *((lambda count=count: Processes(count), "workers") for count in (0, 1000, 1.5))
+)
 
 
 def test_a_large_machine_has_as_many_workers_as_are_allowed(monkeypatch):

@@ -8,23 +8,29 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.roadside import PaintedSite, bent, small, straight
-from helpers.shards import write_shard
+from support.files.folders import write_shard
+from support.worlds.places import PaintedSite, bent, small, straight
 
 from mi_nerfattack.commands.train import Train
 from mi_nerfattack.deploy.roadside.rule import Roadside
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import EvaluateSettings
 from mi_nerfattack.io import files
-from mi_nerfattack.io.locks import exclusive
-from mi_nerfattack.policy.exported.load import load_exported
-from mi_nerfattack.policy.exported.program import export_program
+from mi_nerfattack.policy.exported import export_program, load_exported
 from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, PilotNet
+from mi_nerfattack.report.pages.policy import training_facts
 from mi_nerfattack.system.workers import InThisProcess
+from mi_nerfattack.training import imitate as module
 from mi_nerfattack.training.collect import find_shards
 from mi_nerfattack.training.dataset import FrameDataset
-from mi_nerfattack.training.imitate import _check, imitate
+from mi_nerfattack.training.imitate import Imitated, imitate
 from mi_nerfattack.training.presets import PRESETS, find_preset
+from mi_nerfattack.training.record import (
+    count_frames,
+    read_record,
+    training_record,
+    write_trained,
+)
 from mi_nerfattack.training.settings import ImitationSettings
 from mi_nerfattack.training.train import TrainSettings, fit_policy
 from mi_nerfattack.training.validation import (
@@ -32,6 +38,7 @@ from mi_nerfattack.training.validation import (
     ERROR,
     AbstractValidation,
     ClosedLoop,
+    Epoch,
     rank,
 )
 
@@ -45,11 +52,13 @@ SETTINGS = ImitationSettings(
     dagger_frames={"mitsuba": 32},
     dagger_rounds=1,
     dagger_epochs=1,
-    collecting=small(shard=32),
-    training=TrainSettings(epochs=1, batch=32),
+    horizon=4,
+    collecting=small(shard=8),
+    training=TrainSettings(epochs=1, batch=32, held_out=0.3),
     validation=DRIVE,
     final=DRIVE,
 )
+LONGER = dataclasses.replace(SETTINGS, dagger_rounds=2)
 ROUTES = [straight(), bent()]
 #: Nothing is seen for a minute of a drive of 8 s.
 UNSEEN = Roadside(view_s=60.0)
@@ -82,13 +91,60 @@ def test_imitation_runs_from_frames_to_card_and_resumes(tmp_path):
     again = imitate([SITE], ROUTES, SETTINGS, tmp_path, HERE, note)
     assert "training 0" not in stages
     assert again.history == first.history
-    for one, other in zip(
-        first.module.parameters(), again.module.parameters(), strict=True
-    ):
-        np.testing.assert_array_equal(one.numpy(force=True), other.numpy(force=True))
-    longer = dataclasses.replace(SETTINGS, dagger_rounds=2)
-    more = imitate([SITE], ROUTES, longer, tmp_path, HERE)
+    weights = (item.module.state_dict().values() for item in (first, again))
+    assert all(torch.equal(*pair) for pair in zip(*weights, strict=True))
+    more = imitate([SITE], ROUTES, LONGER, tmp_path, HERE)
     assert more.history[:2] == first.history and len(more.history) == 3
+    with pytest.raises(InputError, match=r"checkpoint_0.*\n  start: .* -> .*\nrestore"):
+        imitate([SITE], ROUTES, SETTINGS, tmp_path, HERE, start=PilotNet(2))
+
+
+def rows(data: FrameDataset) -> set[tuple[bytes, float]]:
+    frames = data.read_frames(np.arange(len(data)))[:, 0, 0]
+    return {(f.tobytes(), c) for f, c in zip(frames, data.controls, strict=True)}
+
+
+def test_rows_that_are_held_out_are_never_trained_on(monkeypatch, tmp_path):
+    rounds: list[tuple[FrameDataset, FrameDataset]] = []
+
+    def fit(module, data, *arguments, held_out, **keywords):
+        rounds.append((data, held_out))
+        return fit_policy(module, data, *arguments, held_out=held_out, **keywords)
+
+    monkeypatch.setattr(module, "fit_policy", fit)
+    result = imitate([SITE], ROUTES, LONGER, tmp_path, HERE)
+    assert len(rounds) == 3 and len(result.shards) == (64 + 32 + 32) // 8
+    trained = set().union(*(rows(data) for data, _ in rounds))
+    for number, (data, held) in enumerate(rounds):
+        assert len(data) + len(held) == 64 + 32 * number
+        assert not trained & rows(held)
+    # a row that was held out stays so
+    assert rows(rounds[0][1]) <= rows(rounds[2][1])
+    assert len(rounds[0][1]) >= 8
+
+
+@pytest.mark.slow
+def test_rounds_of_other_seeds_have_other_frames(tmp_path):
+    frames, order = {}, {}
+    for seed in (0, 1):
+        settings = dataclasses.replace(SETTINGS, seed=seed)
+        imitate([SITE], ROUTES, settings, tmp_path / f"{seed}", HERE)
+        for number in (0, 1):
+            shard = f"round_{number}/mitsuba/shard_0000"
+            for name, seeds in ((shard, frames), (f"checkpoint_{number}", order)):
+                path = tmp_path / f"{seed}" / f"{name}.safetensors"
+                seeds[seed, number] = files.read_safetensors(path)[1]["settings.seed"]
+    assert len(set(frames.values())) == len(set(order.values())) == 4
+
+
+@pytest.mark.slow
+def test_frames_of_rounds_that_are_left_out_are_not_recorded(tmp_path):
+    data = tmp_path / "data"
+    imitate([SITE], ROUTES, LONGER, data, HERE)
+    every = imitate([SITE], ROUTES, SETTINGS, data, HERE).shards
+    assert count_frames(data, every) == {"round_0/mitsuba": 64, "round_1/mitsuba": 32}
+    assert count_frames(tmp_path, every[:1]) == {"data/round_0/mitsuba": 8}
+    assert count_frames(tmp_path / "b", every[:1]) == {"earlier/mitsuba": 8}
 
 
 def test_a_collection_of_its_own_is_held_out(tmp_path):
@@ -98,10 +154,8 @@ def test_a_collection_of_its_own_is_held_out(tmp_path):
     stages = []
     imitate([SITE], ROUTES, settings, tmp_path, HERE, lambda *at: stages.append(at[0]))
     assert "held_out, mitsuba" in stages
-    one, other = (
-        FrameDataset.from_shards(find_shards(tmp_path / name))
-        for name in ("round_0", "held_out")
-    )
+    folders = tmp_path / "round_0", tmp_path / "held_out"
+    one, other = (FrameDataset.from_shards(find_shards(at)) for at in folders)
     assert not np.array_equal(one.controls, other.controls)
 
 
@@ -144,14 +198,8 @@ def test_best_epoch_is_that_of_the_closed_loop(data, rows, best):
     history = fit_policy(module, data, settings, validation=validation)
     assert torch.equal(module.head[-1].weight, validation.weights[best])
     assert [row[ERROR] for row in history] == [error for _, error in rows]
-
-
-def test_loss_decides_among_equals_and_unmeasured_epochs_do_not_count():
-    rows = [
-        {ERROR: 0.0301, DEPARTED: 0, "held_out_loss": 0.2},
-        {ERROR: 0.0304, DEPARTED: 0, "held_out_loss": 0.1},
-    ]
-    assert rank(rows[1]) < rank(rows[0])
+    equal = {ERROR: 0.0301, DEPARTED: 0, "held_out_loss": 0.2}  # the loss decides
+    assert rank({**equal, ERROR: 0.0304, "held_out_loss": 0.1}) < rank(equal)
 
 
 def test_validation_every_second_epoch_and_after_the_last(data):
@@ -187,20 +235,14 @@ def test_exported_program_gives_the_modules_controls(tmp_path):
         torch.testing.assert_close(program(image, goal), module(image, goal))
 
 
-def test_presets_have_the_figures_of_the_paper():
-    assert find_preset("intersection").frames == {
-        "mitsuba": 120_000,
-        "surrogate": 60_000,
-    }
-    assert find_preset("intersection").validation_frames == {"surrogate": 12_000}
-    assert find_preset("room").frames == {"mitsuba": 9_584, "surrogate": 12_000}
-    laptop = find_preset("laptop")
-    total = sum(laptop.frames.values())
-    total += laptop.dagger_rounds * sum(laptop.dagger_frames.values())
-    assert 9_000 <= total <= 11_000
+def test_presets_are_known_by_name():
     with pytest.raises(InputError, match="preset: 'desktop'; one of laptop"):
         find_preset("desktop")
     assert Train(output="o", data="d").preset in PRESETS  # pyright: ignore
+
+
+def drives(**changes):
+    return dataclasses.replace(DRIVE, **changes)
 
 
 @pytest.mark.parametrize(
@@ -209,36 +251,14 @@ def test_presets_have_the_figures_of_the_paper():
         ({"frames": {"moon": 3}}, "frames: of moon"),
         ({"frames": {"mitsuba": 0}}, "at least one frame"),
         ({"validate_in": ("moon",)}, "frames: of moon"),
-        ({"frames": {"mitsuba": -1}}, "frames: .'mitsuba': -1.; must be a whole"),
-        (
-            {"validate_every": 0},
-            "validate_every: 0; must be a whole number",
-        ),
-        (
-            {"dagger_epochs": 0},
-            "dagger_epochs: 0; must be a whole number",
-        ),
-        (
-            {"dagger_rounds": -1},
-            "dagger_rounds: -1; must be a whole number",
-        ),
-        ({"dagger_rate": 0.0}, r"dagger_rate: 0.0; must be .* in \(0, 1\)"),
-        ({"expert_share": 1.1}, r"expert_share: 1.1; must be .* in \[0, 1\]"),
+        ({"frames": {"mitsuba": -1}}, "frames: .'mitsuba': -1."),
+        ({"validate_every": 0}, "validate_every: 0"),
         ({"dagger_frames": {"mitsuba": 0}}, "dagger_rounds: 1 without dagger_frames"),
-        ({"frames": {"mitsuba": 32}}, "frames: 32, one shard of up to 32; at least"),
+        ({"frames": {"mitsuba": 8}}, "frames: 8, .* up to 8"),
         # a lane of 3.5 m, a route of 40 m
-        (
-            {"final": dataclasses.replace(DRIVE, car_width_m=4.0)},
-            "route 'straight': its lane is 3.5 m wide, the vehicle 4.0 m",
-        ),
-        (
-            {"final": dataclasses.replace(DRIVE, objects=(1,), roadside=UNSEEN)},
-            "route 'straight': places for 0 of 1 objects",
-        ),
-        (
-            {"collecting": small(roadside=UNSEEN)},
-            "route 'straight': places for 0 of 1 objects",
-        ),
+        ({"final": drives(car_width_m=4.0)}, "'straight': .* 3.5 m wide, .* 4.0 m"),
+        ({"final": drives(objects=(1,), roadside=UNSEEN)}, "'straight': .* 0 of 1 obj"),
+        ({"collecting": small(roadside=UNSEEN)}, "'straight': .* 0 of 1 objects"),
     ],
 )
 def test_what_cannot_be_trained_is_refused(tmp_path, change, message):
@@ -248,76 +268,39 @@ def test_what_cannot_be_trained_is_refused(tmp_path, change, message):
     assert not list(tmp_path.iterdir())  # told before the first frame
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"frames": {"mitsuba": 64, "surrogate": 0}},
-        {"dagger_rounds": 0, "dagger_frames": {"surrogate": 8}},
-    ],
-)
-def test_sites_without_frames_need_not_be_there(change):
-    settings = dataclasses.replace(SETTINGS, **change)
-    assert settings.sites == ("mitsuba",)
-    _check([SITE], ROUTES, settings, [])
-
-
-def test_goals_cameras_and_weights_must_fit(tmp_path):
-    far = dataclasses.replace(bent(), goal=1000)
-    with pytest.raises(InputError, match="'left': goal 1000; PilotNet has at most"):
-        imitate([SITE], [far], SETTINGS, tmp_path, HERE)
-    small_camera = PaintedSite("mitsuba", size_px=(100, 50))
-    with pytest.raises(InputError, match=r"100 x 50 px; PilotNet takes 200 x 66"):
-        imitate([small_camera], ROUTES, SETTINGS, tmp_path, HERE)
-    with pytest.raises(InputError, match=r"start: .*\(2, 1.5, 'rad/s'\) are needed"):
-        start = PilotNet(2, unit="rad")
-        imitate([SITE], ROUTES, SETTINGS, tmp_path, HERE, start=start)
-    assert not list(tmp_path.iterdir())  # told before the first frame
-
-
-@pytest.mark.parametrize(
-    ("size", "goal", "message"),
-    [
-        (
-            (100, 50),
-            0,
-            "frames of 100 x 50 px; PilotNet takes 200 x 66",
-        ),
-        ((200, 66), 2, "goals: 2 to 2; at least 0 and below 2"),
-    ],
-)
-def test_earlier_frames_must_fit(tmp_path, size, goal, message):
-    frames = np.zeros((1, size[1], size[0], 3), np.uint8)
-    other = write_shard(tmp_path / "other", frames, [goal], [0.0])
-    with pytest.raises(InputError, match=f"other.safetensors: {message}"):
-        imitate([SITE], ROUTES, SETTINGS, tmp_path / "data", HERE, more=[other])
-    assert not (tmp_path / "data").exists()  # told before the first frame
-
-
 @dataclasses.dataclass(frozen=True)
 class MissingSite(PaintedSite):
-    """Needs a package that is not there."""
-
     def open(self, conditions):
         raise InputError("environment 'gone': pip install it")
 
 
-def test_an_environment_that_is_not_there_is_told_before_the_first_frame(tmp_path):
-    missing = MissingSite("mujoco", size_px=(200, 66))
-    settings = dataclasses.replace(SETTINGS, frames={"mitsuba": 64, "mujoco": 1})
-    with pytest.raises(InputError, match="pip install it"):
-        imitate([SITE, missing], ROUTES, settings, tmp_path, HERE)
-    assert not list(tmp_path.iterdir())
+def frames_of(size_px, goal):
+    frames = np.zeros((1, size_px[1], size_px[0], 3), np.uint8)
+    return lambda folder: [write_shard(folder / "other", frames, [goal], [0.0])]
 
 
-def test_one_process_works_in_a_folder(tmp_path):
-    partial = tmp_path / "round_0" / ".shard_0000.safetensors.0123456789ab.tmp"
-    files.make_folder(partial.parent)
-    partial.touch()  # of a killed writer
-    with exclusive(tmp_path), pytest.raises(InputError, match="another process works"):
-        imitate([SITE], ROUTES, SETTINGS, tmp_path, HERE)
-    assert list(tmp_path.rglob("*")) == [partial.parent, partial]
-    imitate([SITE], ROUTES, SETTINGS, tmp_path, HERE)
-    assert not partial.exists()
+BOTH = dataclasses.replace(SETTINGS, frames={"mitsuba": 64, "mujoco": 1})
+MISSING = [SITE, MissingSite("mujoco", size_px=(200, 66))]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"routes": [dataclasses.replace(bent(), goal=1000)]}, "'left': goal 1000"),
+        ({"sites": [PaintedSite("mitsuba", size_px=(100, 50))]}, "100 x 50 px; .* 66"),
+        ({"start": PilotNet(2, unit="rad")}, r"start: .*\(2, 1.5, 'rad/s'\)"),
+        ({"more": frames_of((100, 50), 0)}, "other.safetensors: .* 100 x 50 px"),
+        ({"more": frames_of((200, 66), 2)}, "other.safetensors: goals: 2 to 2"),
+        ({"sites": MISSING, "settings": BOTH}, "pip install it"),
+    ],
+)
+def test_goals_cameras_frames_and_weights_must_fit(tmp_path, change, message):
+    arguments = {"sites": [SITE], "routes": ROUTES, "settings": SETTINGS} | change
+    if "more" in change:
+        arguments["more"] = change["more"](tmp_path)
+    with pytest.raises(InputError, match=message):
+        imitate(folder=tmp_path / "data", workers=HERE, **arguments)
+    assert not any((tmp_path / "data").rglob("*"))  # told before the first frame
 
 
 @pytest.mark.parametrize("goals", [(2, 1), (2, 2)])
@@ -325,16 +308,47 @@ def test_goals_are_numbers_of_manoeuvres_not_of_routes(tmp_path, goals):
     """They need not begin with 0, and routes may share one."""
     pairs = zip(ROUTES, goals, strict=True)
     routes = [dataclasses.replace(route, goal=goal) for route, goal in pairs]
-    settings = dataclasses.replace(SETTINGS, dagger_rounds=0)
-    found = imitate([SITE], routes, settings, tmp_path, HERE)
+    frames = {"mitsuba": 64, "surrogate": 0}  # whose site need not be there
+    settings = dataclasses.replace(SETTINGS, dagger_rounds=0, frames=frames)
+    # first weights may have more goals
+    start = PilotNet(3) if goals[0] == goals[1] else None
+    found = imitate([SITE], routes, settings, tmp_path, HERE, start=start)
     assert found.module.goals == 3
     data = FrameDataset.from_shards(find_shards(tmp_path))
     assert set(data.goals) == set(goals)
 
 
-def test_first_weights_may_have_more_goals(tmp_path):
-    """A policy for three manoeuvres goes on with routes of one."""
-    settings = dataclasses.replace(SETTINGS, dagger_rounds=0)
-    start = PilotNet(3)
-    found = imitate([SITE], [straight()], settings, tmp_path, HERE, start=start)
-    assert found.module.goals == 3
+@pytest.mark.parametrize(
+    "text",
+    ['{"schema": "1.0"}', '{"training": true}', '{"schema": 2, "training": [1]}', "[]"],
+)
+def test_another_program_s_file_beside_a_policy_is_no_record(tmp_path, text):
+    (tmp_path / "net.json").write_text(text)
+    assert read_record(tmp_path / "net.json") is None
+
+
+def test_a_training_writes_down_its_data_and_settings(tmp_path):
+    folder = files.make_folder(tmp_path / "round_0" / "painted")
+    frames = np.zeros((12, 2, 2, 3), np.uint8)
+    shard = write_shard(folder / "shard_0000", frames, [0] * 12, [0.0] * 12)
+    settings = ImitationSettings({"painted": 12}, seed=5)
+    row = Epoch(train_loss=2.0, held_out_loss=1.0, held_out_error=0.1, measured=True)
+    rows = [[row, {**row, "held_out_loss": 0.5}]]
+    result = Imitated(PilotNet(2).eval(), rows, 0, {}, [shard])
+    record = training_record(settings, [PaintedSite()], tmp_path, result, "train it")
+    write_trained(tmp_path / "net.safetensors", result.module, record)
+    found = read_record(tmp_path / "net.json")
+    assert found and found.model_dump() == record.model_dump(mode="json")
+    nothing = training_record(settings, [], tmp_path / "empty", result, "")
+    assert nothing.data == {"earlier/painted": 12}
+    facts = training_facts(record)
+    assert facts["command"] == "train it" and facts["seed"] == 5
+    assert facts["augmentation"]["exposure_ev"] > 0
+    assert facts["data"] == {"round_0/painted": 12}
+    # those of the collections and trainings are others: theirs are overridden
+    assert not {"frames", "seed"} & set(facts["settings"]["collecting"])
+    assert "seed" not in facts["settings"]["training"]
+    kinds = [item["kind"] for item in facts["settings"]["cloning"]["sources"]]
+    assert kinds == ["scattered", "expert"]
+    (first,) = facts["rounds"]
+    assert first == {"epochs": 2, "held_out_loss": 0.5, "closed_loop_error_m": None}

@@ -1,4 +1,4 @@
-"""Vehicles with slip and with a steering lag, and the linear systems of their steps."""
+"""Vehicle models and time steps against closed forms, scipy and differences."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers.states import row64, state64
 from scipy.integrate import solve_ivp
+from support.faults.refusals import refusals
+from support.reference.derivatives import row64, state64
 
 from mi_nerfattack.vehicle import (
     RK4,
+    AbstractDynamics,
     Ackermann,
     Dubins,
     ExplicitEuler,
@@ -18,80 +20,179 @@ from mi_nerfattack.vehicle import (
     KinematicBicycle,
     RateLimitedAckermann,
 )
-from mi_nerfattack.vehicle.linear import solve_columns
+from mi_nerfattack.vehicle.integrators import solve_columns
+from mi_nerfattack.vehicle.steering import heading_rate, steering_angle
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-MODELS = [
-    Dubins(5.0, 1.5),
-    Ackermann(4.0, 2.5, 0.6),
-    KinematicBicycle(4.0, 1.1, 1.4, 0.6),
-    RateLimitedAckermann(4.0, 2.5, 0.6, 0.7, 0.1),
-]
-LIMITS = [1.5, 0.6, 0.6, 0.6]
-LAG = MODELS[3]
+INTEGRATORS = [ExplicitEuler(), RK4(), ImplicitMidpoint()]
+ORDERS = list(zip(INTEGRATORS, (1, 4, 2), strict=True))
+LAG = RateLimitedAckermann(4.0, 2.5, 0.6, 0.7, 0.1)
+ACKERMANN, BICYCLE = Ackermann(4.0, 2.5, 0.6), KinematicBicycle(4.0, 1.1, 1.4, 0.6)
+#: Models with their limits of the control.
+MODELS = [(Dubins(5.0, 1.5), 1.5), (ACKERMANN, 0.6), (BICYCLE, 0.6), (LAG, 0.6)]
 
 
-def drive(dynamics, start, controls, dt, integrator=None):
+class Spring(AbstractDynamics):
+    """User's own stiff nonlinear model, to which Newton must really iterate."""
+
+    def derivative(self, state, control):
+        return type(state)(
+            state[1], -6 * state[0] ** 3 - state[1] + control, state[0] - 50 * state[2]
+        )
+
+    def saturate(self, control):
+        return control
+
+
+def drive(dynamics, start, controls, dt, integrator=INTEGRATORS[1]):
     """Return the states (m, steps + 1) of one vehicle; controls are not limited."""
     x, path = state64(np.reshape(start, (-1, 1))), [np.array(start, float)]
     for control in controls:
-        x = (integrator or RK4()).step(dynamics, x, row64([control]), dt)
+        x = integrator.step(dynamics, x, row64([control]), dt)
         dr.eval(x)
         path.append(x.numpy()[:, 0].copy())
     return np.stack(path, axis=1)
 
 
-def saturated_derivative(dynamics, x, u):
-    return dynamics.derivative(x, dynamics.saturate(u))
+def forward_mode(call, point, tangent, cotangent):
+    """Differentiate a function of rows; reverse mode must be the transpose."""
+    rows = [row64(value) for value in point]
+    dr.enable_grad(*rows)
+    result = call(rows)
+    for row, direction in zip(rows, tangent, strict=True):
+        dr.set_grad(row, row64(direction))
+    # an entry may be an input of the others, whose gradient must be kept
+    forward = dr.forward_to(result, flags=dr.ADFlag.ClearEdges).numpy()
+    rows = [row64(value) for value in point]
+    dr.enable_grad(*rows)
+    weights = [row64(value) for value in cotangent]
+    result = call(rows)
+    dr.backward(sum(dr.sum(a * b) for a, b in zip(result, weights, strict=True)))
+    reverse = np.stack([dr.grad(row).numpy() for row in rows])
+    left, right = (reverse * tangent).sum(), (forward * cotangent).sum()
+    assert left == pytest.approx(right, rel=1e-11)
+    return forward
 
 
-def difference(f, h):
-    """Differentiate at 0 with an error of sixth order."""
-    return (
-        45 * (f(h) - f(-h)) - 9 * (f(2 * h) - f(-2 * h)) + (f(3 * h) - f(-3 * h))
-    ) / (60 * h)
+def difference(call, point, tangent, h):
+    def f(s):
+        return call([row64(value) for value in point + s * h * tangent]).numpy()
+
+    return (45 * (f(1) - f(-1)) - 9 * (f(2) - f(-2)) + f(3) - f(-3)) / (60 * h)
 
 
-@pytest.mark.parametrize(("dynamics", "limit"), list(zip(MODELS, LIMITS, strict=True)))
+def rows_of(values):
+    return (dr.llvm.ad.Array3f64 if len(values) == 3 else dr.llvm.ad.ArrayXf64)(*values)
+
+
+@pytest.mark.parametrize(("dynamics", "limit"), MODELS)
 def test_jacobians(dynamics, limit):
-    """Forward mode is central differences to 1e-8; reverse mode its transpose."""
+    """With controls from zero to far beyond their limit."""
     rng, m = np.random.default_rng(1), dynamics.state_size
-    # Controls from zero to far beyond their limit.
     point = np.vstack([rng.normal(size=(m, 6)) * 0.4, limit * np.linspace(0, 2.5, 6)])
     cotangent = rng.normal(size=(m, 6))
-    scale = np.array([1.0] * m + [limit])[:, None]
+
+    def call(rows):
+        return dynamics.derivative(rows_of(rows[:m]), dynamics.saturate(rows[m]))
+
     for _ in range(3):
-        tangent = rng.normal(size=point.shape) * scale
+        tangent = rng.normal(size=point.shape)
+        tangent[m] *= limit
+        expected = difference(call, point, tangent, 3e-4)
+        found = forward_mode(call, point, tangent, cotangent)
+        atol = 1e-8 * np.abs(expected).max()
+        np.testing.assert_allclose(found, expected, rtol=1e-8, atol=atol)
 
-        def call(values):
-            return saturated_derivative(dynamics, state64(values[:m]), row64(values[m]))
 
-        def shifted(h, tangent=tangent):
-            return call(point + h * tangent).numpy()
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("dynamics", [LAG, Spring()])
+@pytest.mark.parametrize("function", ["step", "residual"])
+def test_derivatives_of_a_step(integrator, dynamics, function):
+    rng, m = np.random.default_rng(2), dynamics.state_size
+    point = rng.normal(size=(2 * m + 1, 4)) * 0.4
+    tangent, cotangent = rng.normal(size=(2 * m + 1, 4)), rng.normal(size=(m, 4))
 
-        numeric = difference(shifted, 3e-4)
-        x, u = state64(point[:m]), row64(point[m])
-        dr.enable_grad(x, u)
-        dr.set_grad(x, state64(tangent[:m]))
-        dr.set_grad(u, row64(tangent[m]))
-        forward = dr.forward_to(saturated_derivative(dynamics, x, u)).numpy()
-        np.testing.assert_allclose(
-            forward, numeric, rtol=1e-8, atol=1e-8 * np.abs(numeric).max()
-        )
-        x, u = state64(point[:m]), row64(point[m])
-        dr.enable_grad(x, u)
-        result = saturated_derivative(dynamics, x, u)
-        dr.backward(dr.sum(dr.sum(result * state64(cotangent), axis=0)))
-        reverse = np.vstack([dr.grad(x).numpy(), dr.grad(u).numpy()[None]])
-        left, right = (reverse * tangent).sum(), (forward * cotangent).sum()
-        assert left == pytest.approx(right, rel=1e-12)
+    def call(rows):
+        x_prev, x, u = rows_of(rows[:m]), rows_of(rows[m : 2 * m]), rows[-1]
+        if function == "step":
+            return integrator.step(dynamics, x_prev, u, 0.1)
+        return integrator.residual(dynamics, x_prev, x, u, 0.1)
+
+    found = forward_mode(call, point, tangent, cotangent)
+    expected = difference(call, point, tangent, 1e-3)
+    np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("dynamics", [LAG, Spring()])
+def test_residual_of_a_step_is_zero(integrator, dynamics):
+    rng = np.random.default_rng(1)
+    x_prev = state64(0.5 * rng.normal(size=(dynamics.state_size, 7)))
+    u = row64(rng.uniform(-0.5, 0.5, 7))
+    x = integrator.step(dynamics, x_prev, u, 0.05)
+    residual = integrator.residual(dynamics, x_prev, x, u, 0.05)
+    assert np.abs(residual.numpy()).max() < 1e-13
+    integrator.check(dynamics, x_prev, x, u, 0.05)
+
+
+def diverged():
+    start, u = state64([[2.0], [9.0], [0.0]]), row64([0.0])
+    end = ImplicitMidpoint(1).step(Spring(), start, u, 3.0)
+    ImplicitMidpoint(1).check(Spring(), start, end, u, 3.0)
+
+
+test_refused = refusals(
+    (diverged, "dt = 3.0 s"),
+    (lambda: ImplicitMidpoint(0), "iterations"),
+    (lambda: Dubins(5.0, float("nan")), "max_heading_rate"),
+    (lambda: Ackermann(5.0, -1.0), "wheelbase"),
+    (lambda: KinematicBicycle(5.0, 0.0), "front_m"),
+    (lambda: RateLimitedAckermann(max_steer_rate=-1.0), "max_steer_rate"),
+)
+
+
+@pytest.mark.parametrize(("integrator", "order"), ORDERS)
+def test_steps_converge_to_scipys_solution(integrator, order):
+    def slope(_, x):
+        raw = (0.25 - x[3]) / 0.1
+        rate = raw / (1 + (raw / 0.7) ** 8) ** 0.125
+        return [4 * np.cos(x[2]), 4 * np.sin(x[2]), 4 / 2.5 * np.tan(x[3]), rate]
+
+    start = [0.0, 0.0, 0.4, 0.2]
+    exact = solve_ivp(slope, (0, 0.6), start, rtol=1e-12, atol=1e-13).y[:, -1]
+    ends = [drive(LAG, start, [0.25] * n, 0.6 / n, integrator)[:, -1] for n in (20, 40)]
+    errors = np.abs(np.array(ends) - exact).max(1)
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.2)
+
+
+def test_midpoint_is_its_closed_form():
+    # Dubins' heading is linear in time, so the implicit step has a closed form.
+    found = drive(Dubins(5.0), [1.0, 2.0, 0.4], [0.7], 0.1, ImplicitMidpoint())[:, 1]
+    middle = 0.4 + 0.05 * 0.7
+    exact = [1 + 0.5 * np.cos(middle), 2 + 0.5 * np.sin(middle), 0.47]
+    np.testing.assert_allclose(found, exact, rtol=0, atol=1e-14)
+
+
+def test_vehicles_start_at_rest():
+    poses = np.array([[1.0, 2.0, 0.3], [4.0, 5.0, 0.6]])
+    np.testing.assert_array_equal(MODELS[0][0].extend(poses), poses)
+    np.testing.assert_array_equal(LAG.extend(poses), np.c_[poses, [0.0, 0.0]])
+    np.testing.assert_array_equal(LAG.extend(poses[0]), [[1.0, 2.0, 0.3, 0.0]])
+
+
+def test_steering_in_numpy_is_the_models_own():
+    angles = np.array([-0.5, -0.1, 0.0, 0.3])
+    rates = heading_rate(angles, 4.0, 2.5)
+    turned = ACKERMANN.derivative(state64(np.zeros((3, 4))), row64(angles))[2]
+    np.testing.assert_allclose(rates, turned.numpy(), rtol=1e-12)
+    np.testing.assert_allclose(steering_angle(rates, 4.0, 2.5), angles, atol=1e-12)
 
 
 def test_bicycle_is_ackermann_seen_from_the_middle():
     """Its rear axle follows Ackermann's path at the speed v cos(beta)."""
     steer = 0.4 * np.sin(np.arange(80) / 9)
-    path = drive(MODELS[2], [1.4, 0.0, 0.0], steer, 0.05)
+    path = drive(BICYCLE, [1.4, 0.0, 0.0], steer, 0.05)
     x = y = heading = 0.0
     for angle in steer:  # an arc of the rear axle a step
         slip = np.arctan(1.4 / 2.5 * np.tan(angle))
@@ -105,7 +206,22 @@ def test_bicycle_is_ackermann_seen_from_the_middle():
     np.testing.assert_allclose([*rear, end[2]], [x, y, heading], atol=1e-6)
 
 
-@pytest.mark.parametrize("integrator", [ExplicitEuler(), RK4(), ImplicitMidpoint()])
+@pytest.mark.parametrize(("dynamics", "limit"), MODELS)
+def test_saturation(dynamics, limit):
+    u = row64(limit * np.array([-1e30, -1, -0.5, 0, 0.5, 1, 3, 1e30]))
+    dr.enable_grad(u)
+    y = dynamics.saturate(u)
+    dr.backward(dr.sum(y))
+    expected = [-1, -(2**-0.125), -0.5, 0, 0.5, 2**-0.125, 1, 1]
+    np.testing.assert_allclose(y.numpy() / limit, expected, atol=3e-4)
+    slope = dr.grad(u).numpy()
+    assert slope[3] == 1
+    np.testing.assert_allclose(slope[[1, 5]], 2**-1.125, rtol=1e-12)
+    assert slope[6] == pytest.approx((1 + 3.0**8) ** (-9 / 8), rel=1e-10)
+    assert np.isfinite(slope).all() and (slope >= 0).all()
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_steering_keeps_its_rate_and_angle(integrator):
     commands = LAG.saturate(row64([9.0] * 25 + [-9.0] * 60)).numpy()
     delta = drive(LAG, [0.0, 0.0, 0.0, 0.0], commands, 0.05, integrator)[3]
@@ -125,134 +241,74 @@ def test_saturated_steering_can_still_be_moved():
         x = RK4().step(LAG, x, LAG.saturate(u), 0.05)
     dr.backward(dr.sum(x[2]))
     slope = dr.grad(u).numpy()
-    assert (slope > 1e-12).all()
-    assert slope[0] > slope[1]
+    assert (slope > 1e-12).all() and slope[0] > slope[1]
     assert slope[1] == pytest.approx(slope[2], rel=1e-12)
 
 
-@pytest.mark.parametrize(("integrator", "order"), [(RK4(), 4), (ImplicitMidpoint(), 2)])
-def test_orders_with_four_rows(integrator, order):
-    def slope(_, x):
-        raw = (0.25 - x[3]) / 0.1
-        rate = raw / (1 + (raw / 0.7) ** 8) ** 0.125
-        return [4 * np.cos(x[2]), 4 * np.sin(x[2]), 4 / 2.5 * np.tan(x[3]), rate]
-
-    start = [0.0, 0.0, 0.4, 0.2]
-    exact = solve_ivp(slope, (0, 0.6), start, rtol=1e-12, atol=1e-13).y[:, -1]
-    command = 0.25
-    errors = [
-        np.abs(steps_to(integrator, start, command, n) - exact).max() for n in (20, 40)
-    ]
-    assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.2)
-
-
-def steps_to(integrator, start, command, count):
-    """Drive 0.6 s in `count` steps with an unsaturated command."""
-    x = state64(np.reshape(start, (4, 1)))
-    for _ in range(count):
-        x = integrator.step(LAG, x, row64([command]), 0.6 / count)
-        dr.eval(x)
-    return x.numpy()[:, 0]
-
-
-def test_states_start_at_rest():
-    poses = np.array([[1.0, 2.0, 0.3], [4.0, 5.0, 0.6]])
-    np.testing.assert_array_equal(MODELS[0].extend(poses), poses)
-    np.testing.assert_array_equal(LAG.extend(poses), np.c_[poses, [0.0, 0.0]])
-    np.testing.assert_array_equal(LAG.extend(poses[0]), [[1.0, 2.0, 0.3, 0.0]])
-    assert [model.state_size for model in MODELS] == [3, 3, 3, 4]
-
-
-@pytest.mark.parametrize("integrator", [RK4(), ImplicitMidpoint()])
-@pytest.mark.parametrize("dynamics", MODELS[2:])
+@pytest.mark.parametrize("integrator", INTEGRATORS[1:])
+@pytest.mark.parametrize("dynamics", [BICYCLE, LAG])
 def test_steps_and_their_derivatives_can_be_recorded(integrator, dynamics):
     """One recording serves other values; nothing is compiled for them."""
-    assert dynamics.recordable
 
-    def step(x, u):
-        return integrator.step(dynamics, x, dynamics.saturate(u), 0.1)
-
-    def product(x, u, weight):
+    def both(x, u, weight):
+        end = integrator.step(dynamics, x, dynamics.saturate(u), 0.1)
         x, u = type(x)(x), type(u)(u)
         dr.enable_grad(x, u)
-        dr.backward_from(dr.sum(step(x, u) * weight, axis=0))
-        return dr.grad(x), dr.grad(u)
+        again = integrator.step(dynamics, x, dynamics.saturate(u), 0.1)
+        dr.backward_from(dr.sum(again * weight, axis=0))
+        return end, dr.grad(x), dr.grad(u)
 
-    frozen = dr.freeze(lambda x, u, weight: (step(x, u), product(x, u, weight)))
-    rng, m = np.random.default_rng(3), dynamics.state_size
+    assert dynamics.recordable
+    frozen, rng, m = dr.freeze(both), np.random.default_rng(3), dynamics.state_size
     for _ in range(3):
-        arrays = rng.normal(size=(2 * m + 1, 4)) * 0.4
-        # lists: the alignment of NumPy's memory is part of a recording
-        rows = [dr.llvm.ad.Float64(item) for item in arrays.tolist()]
-        kind = type(state64(arrays[:m]))
-        arguments = kind(*rows[:m]), rows[m], kind(*rows[m + 1 :])
-        found, gradients = frozen(*arguments)
-        expected = step(*arguments[:2])
-        np.testing.assert_allclose(found.numpy(), expected.numpy(), atol=1e-13)
-        for one, other in zip(gradients, product(*arguments), strict=True):
+        rows = [row64(item) for item in rng.normal(size=(2 * m + 1, 4)) * 0.4]
+        arguments = rows_of(rows[:m]), rows[m], rows_of(rows[m + 1 :])
+        for one, other in zip(frozen(*arguments), both(*arguments), strict=True):
             np.testing.assert_allclose(one.numpy(), other.numpy(), atol=1e-13)
     assert frozen.n_recordings == 1
 
 
-def matrices(size):
-    """Return well-conditioned systems that need a pivot in every column, (k, m, m)."""
+def test_float32_state_and_batch_of_the_active_variant():
+    """Single precision agrees with double, and stays single."""
+    rng = np.random.default_rng(4)
+    u = rng.uniform(-0.5, 0.5, 5)
+    for dynamics, _ in MODELS:
+        m = dynamics.state_size
+        x = rng.normal(size=(m, 5)) * 0.4
+        kind = mi.Vector3f if m == 3 else mi.ArrayXf
+        state = kind(*[mi.Float(row) for row in x])
+        for integrator in INTEGRATORS:
+            found = integrator.step(dynamics, state, mi.Float(u), 0.1)
+            integrator.check(dynamics, state, found, mi.Float(u), 0.1)
+            expected = integrator.step(dynamics, state64(x), row64(u), 0.1)
+            assert type(found) is kind
+            np.testing.assert_allclose(found.numpy(), expected.numpy(), atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [1, 2, 4, 6])
+def test_solve_columns(size):
+    """Systems that need a pivot in every column, and `dx = A^-1 (db - dA x)`."""
     rng = np.random.default_rng(size)
     shuffled = [np.eye(size)[rng.permutation(size)] for _ in range(6)]
-    return np.array(shuffled) * 2 + rng.uniform(-0.2, 0.2, (6, size, size))
-
-
-def solve(systems, right):
-    columns = [state_of(systems[:, :, j].T) for j in range(systems.shape[1])]
-    return solve_columns(columns, state_of(right.T))
-
-
-def state_of(values):
-    """Upload (m, n) for any m."""
-    return dr.llvm.ad.ArrayXf64(*[row64(item) for item in values])
-
-
-@pytest.mark.parametrize("size", [1, 2, 3, 4, 6])
-def test_solve_columns(size):
-    systems = matrices(size)
+    systems = np.array(shuffled) * 2 + rng.uniform(-0.2, 0.2, (6, size, size))
     systems[0] = np.eye(size)[::-1] * 3  # zeros on the diagonal
-    right = np.random.default_rng(9).normal(size=(6, size))
-    expected = np.linalg.solve(systems, right[:, :, None])[:, :, 0]
-    np.testing.assert_allclose(solve(systems, right).numpy().T, expected, rtol=1e-12)
+    right, d_right, weight = rng.normal(size=(3, 6, size, 1))
+    d_systems = rng.normal(size=systems.shape)
+    x = np.linalg.solve(systems, right)
 
+    def rows(matrices, vectors):
+        """Flatten to rows (m (m + 1), n), column by column."""
+        whole = np.concatenate([matrices, vectors], 2)
+        return whole.transpose(2, 1, 0).reshape(-1, 6)
 
-def test_solve_columns_derivative():
-    """`dx = A^-1 (db - dA x)`, in both modes."""
-    systems, rng = matrices(4), np.random.default_rng(2)
-    right, d_right = rng.normal(size=(2, 6, 4))
-    d_systems, weight = rng.normal(size=systems.shape), rng.normal(size=(6, 4))
-    x = np.linalg.solve(systems, right[:, :, None])
-    expected = np.linalg.solve(systems, d_right[:, :, None] - d_systems @ x)[:, :, 0]
-    leaves = [state_of(systems[:, :, j].T) for j in range(4)] + [state_of(right.T)]
-    tangents = [state_of(d_systems[:, :, j].T) for j in range(4)]
-    tangents.append(state_of(d_right.T))
-    dr.enable_grad(*leaves)
-    for leaf, tangent in zip(leaves, tangents, strict=True):
-        dr.set_grad(leaf, tangent)
-    # The last unknown is an input of the others, whose gradient must be kept.
-    result = solve_columns(leaves[:4], leaves[4])
-    forward = dr.forward_to(result, flags=dr.ADFlag.ClearEdges).numpy().T
-    np.testing.assert_allclose(forward, expected, rtol=1e-11)
-    leaves = [type(leaf)(dr.detach(leaf)) for leaf in leaves]
-    dr.enable_grad(*leaves)
-    result = solve_columns(leaves[:4], leaves[4])
-    dr.backward(dr.sum(dr.sum(result * state_of(weight.T), axis=0)))
-    left = sum(
-        (dr.grad(leaf).numpy() * tangent.numpy()).sum()
-        for leaf, tangent in zip(leaves, tangents, strict=True)
-    )
-    assert left == pytest.approx((forward * weight).sum(), rel=1e-11)
+    def call(values):
+        columns = [values[i * size : (i + 1) * size] for i in range(size + 1)]
+        *columns, last = (dr.llvm.ad.ArrayXf64(*column) for column in columns)
+        return solve_columns(columns, last)
 
-
-def test_solve_columns_in_single_precision():
-    systems = matrices(4)
-    columns = [
-        mi.ArrayXf(*[mi.Float(item) for item in systems[:, :, j].T]) for j in range(4)
-    ]
-    found = solve_columns(columns, mi.ArrayXf(1, 2, 3, 4))
-    expected = np.linalg.solve(systems, np.array([1.0, 2, 3, 4])[None, :, None])
-    np.testing.assert_allclose(found.numpy().T, expected[:, :, 0], rtol=1e-5)
+    point, tangent = rows(systems, right), rows(d_systems, d_right)
+    found = call([row64(value) for value in point]).numpy().T
+    np.testing.assert_allclose(found, x[..., 0], rtol=1e-12)
+    found = forward_mode(call, point, tangent, weight[..., 0].T).T
+    expected = np.linalg.solve(systems, d_right - d_systems @ x)[..., 0]
+    np.testing.assert_allclose(found, expected, rtol=1e-11)

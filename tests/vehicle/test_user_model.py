@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import doctest
-from dataclasses import replace
 
 import drjit as dr
 import numpy as np
 import pytest
 import torch
-from helpers import analytic_loop as analytic
-from helpers.states import row64, state64
+from support.faults.refusals import refusals
+from support.reference import loop as analytic
+from support.reference.derivatives import row64, state64
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.rollout.function import Rollout
-from mi_nerfattack.rollout.objective import StageSum
 from mi_nerfattack.vehicle import (
     RK4,
     Dubins,
@@ -72,128 +70,77 @@ def test_own_model_equals_ours(framework, count, integrator):
     assert own.recordable == (framework == "drjit")
 
 
-@pytest.mark.parametrize("framework", OWN)
-def test_whole_loop_with_an_own_model(framework):
-    """The loop's gradient is autograd's through the whole of the loop in torch."""
-    ours, twin = analytic.make_pair("ackermann_rate", "rk4", 2, 1)
-    loop = replace(ours, dynamics=OWN[framework])
-    poses = analytic.random_poses(3)
-    initial = torch.tensor(OWN[framework].extend(poses), requires_grad=True)
-    texture = torch.tensor(loop.sensor.textures()[0].numpy(), requires_grad=True)
-    states, _ = twin.drive(initial, [texture], 6, True)
-    cost = (states[:, 1:, 1] ** 2).sum(1).mean()
-    expected = torch.autograd.grad(cost, [texture, initial])
-    rollout = Rollout(loop, StageSum(lambda x: x[1] * x[1]), 6, attached=True)
-    evaluation = rollout.run(loop.initial(poses))
-    gradient = rollout.gradient(evaluation)
-    assert evaluation.value == pytest.approx(cost.item(), rel=1e-11)
-    np.testing.assert_allclose(
-        gradient.textures[0].numpy(), expected[0], rtol=1e-8, atol=1e-10
-    )
-    np.testing.assert_allclose(
-        gradient.initial.numpy().T, expected[1], rtol=1e-8, atol=1e-10
-    )
-
-
-def test_example_of_the_docstring():
-    assert doctest.testmod(user_model).failed == 0
-
-
-def test_single_precision_in_torch():
+def test_what_may_be_returned():
     own = TorchDynamics(lambda x, u: torch.stack([x[:, 0], x[:, 1], u], 1))
-    state = dr.llvm.ad.Array3f(1, 2, dr.llvm.ad.Float(3, 4))
+    state = dr.llvm.ad.Array3f(1, 2, dr.llvm.ad.Float(3, 4))  # single precision
     found = own.derivative(state, dr.llvm.ad.Float(0.5, 0.25))
     assert type(found) is type(state)
     np.testing.assert_array_equal(found.numpy(), [[1, 1], [2, 2], [0.5, 0.25]])
-
-
-def test_numbers_and_single_rows_are_taken():
-    own = FunctionDynamics(lambda x, u: (1.5, dr.cos(x[2]), u))
+    own = FunctionDynamics(lambda x, u: (1.5, dr.cos(x[2]), u))  # numbers, single rows
     found = own.derivative(state64(np.zeros((3, 4))), row64([1, 2, 3, 4]))
     np.testing.assert_array_equal(found.numpy(), [[1.5] * 4, [1.0] * 4, [1, 2, 3, 4]])
+    own = FunctionDynamics(lambda x, u: (dr.abs(x[0]), dr.maximum(x[1], 0), u))  # kinks
+    start = state64([[0.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
+    require_model("own", own, start, row64([0.1, 0.2]))
+    assert doctest.testmod(user_model).failed == 0
 
 
 @pytest.mark.parametrize("kind", [FunctionDynamics, TorchDynamics])
 def test_initial_values_of_other_rows(kind):
     poses = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
-    np.testing.assert_array_equal(
-        kind(len, 5, 1.0, (7.0, 8.0)).extend(poses), np.c_[poses, [[7, 8], [7, 8]]]
+    for rows, own in (
+        ([[7, 8]] * 2, kind(len, 5, 1.0, (7.0, 8.0))),
+        ([0, 0], kind(len, 4)),
+        (np.zeros((2, 0)), kind(len)),
+    ):
+        np.testing.assert_array_equal(own.extend(poses), np.c_[poses, rows])
+
+
+F, T = FunctionDynamics, TorchDynamics
+REFUSED = (
+    ((2,), "size: 2"),
+    ((3, 0.0), "limit: 0.0"),
+    ((3, 1.0, (1.0,)), "rest: .*; 0 finite"),
+    ((4, 1.0, (float("nan"),)), r"rest: \(nan,\)"),
+)
+test_arguments_that_are_refused = refusals(
+    *(
+        (lambda k=k, a=a: k(len, *a), f"{k.__name__}.{w}")
+        for k in (F, T)
+        for a, w in REFUSED
     )
-    np.testing.assert_array_equal(kind(len, 4).extend(poses), np.c_[poses, [0, 0]])
-    np.testing.assert_array_equal(kind(len).extend(poses), poses)
+)
 
 
-@pytest.mark.parametrize("kind", [FunctionDynamics, TorchDynamics])
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("kind", "returned", "words"),
     [
-        ((2,), r"size: 2; .* at least 3"),
-        ((3, 0.0), r"limit: 0.0"),
-        ((3, 1.0, (1.0,)), r"rest: .*; 0 finite"),
-        ((5, 1.0, (1.0,)), r"rest: .*; 2 finite"),
-        ((4, 1.0, (float("nan"),)), r"rest: \(nan,\)"),
+        (F, lambda x, u: None, "NoneType"),
+        (F, lambda x, u: np.zeros((3, 3)), r"ndarray of shape \(3, 3\)"),
+        (F, lambda x, u: ("a", u, u), r"\(str, Float64, Float64\)"),
+        (F, lambda x, u: (u, u, row64([1, 2])), r"\[3, 3, 2\] entries"),
+        (F, lambda x, u: (x[0], x[1], dr.detach(u)), "derivative"),
+        (F, lambda x, u: x[7], r"line \d+"),
+        (T, lambda x, u: None, r"NoneType; .*\(3, 3\)"),
+        (T, lambda x, u: x[:, :2], r"\(3, 2\)"),
+        (T, lambda x, u: x / 0, r"\[inf, inf, inf\] for vehicle 0"),
+        (T, lambda x, u: x.detach(), "derivative"),
+        (T, lambda x, u: x.wheel, "AttributeError in line"),
     ],
 )
-def test_own_models_reject_parameters(kind, arguments, words):
-    with pytest.raises(InputError, match=f"{kind.__name__}.{words}"):
-        kind(len, *arguments)
-
-
-def call(own):
-    """Evaluate at three vehicles, differentiating by the control."""
+def test_what_a_function_must_not_return(kind, returned, words):
+    message = rf"{kind.__name__}\(test_user_model.py:<lambda>\): .*{words}"
+    own = kind(returned)
     x, u = state64(np.ones((own.state_size, 3))), row64([0.1, 0.2, 0.3])
     dr.enable_grad(u)
-    dr.backward(dr.sum(dr.sum(own.derivative(x, u), axis=0)))
-
-
-@pytest.mark.parametrize(
-    ("returned", "words"),
-    [
-        (lambda x, u: None, "returned NoneType; 3 rows"),
-        (lambda x, u: 5.0, "returned float"),
-        (lambda x, u: u, "returned Float64"),
-        (lambda x, u: [x[0], u], "returned 2 rows; 3 rows"),
-        (lambda x, u: np.zeros((3, 3)), r"returned ndarray of shape \(3, 3\)"),
-        (lambda x, u: ("a", u, u), r"rows \(str, Float64, Float64\)"),
-        (lambda x, u: (u, u, row64([1, 2])), r"rows of \[3, 3, 2\] entries"),
-        (lambda x, u: (x[0], x[1], dr.detach(u)), "no derivative by the control"),
-        (lambda x, u: x[7], r"raised \w+ in line \d+"),
-    ],
-)
-def test_what_a_function_must_not_return(returned, words):
-    message = rf"FunctionDynamics\(test_user_model.py:<lambda>\): .*{words}"
     with pytest.raises(InputError, match=message):
-        call(FunctionDynamics(returned))
-
-
-@pytest.mark.parametrize(
-    ("returned", "words"),
-    [
-        (lambda x, u: None, r"returned NoneType; a tensor \(3, 3\)"),
-        (lambda x, u: x[:, :2], r"returned Tensor of shape \(3, 2\)"),
-        (lambda x, u: x / 0, r"gave \[inf, inf, inf\] for vehicle 0"),
-        (lambda x, u: x.detach(), "no derivative by the control"),
-        (lambda x, u: 2 * x, "no derivative by the control"),
-        (lambda x, u: x @ u, "returned Tensor of shape"),
-        (lambda x, u: x.wheel, "raised AttributeError in line"),
-    ],
-)
-def test_what_a_torch_function_must_not_return(returned, words):
-    message = rf"TorchDynamics\(test_user_model.py:<lambda>\): .*{words}"
-    with pytest.raises(InputError, match=message):
-        call(TorchDynamics(returned))
+        dr.backward(dr.sum(dr.sum(own.derivative(x, u), axis=0)))
 
 
 def test_states_that_are_not_finite_are_reported():
-    own = FunctionDynamics(lambda x, u: (x[0], x[1], u / (x[2] - 1)))
+    own = F(lambda x, u: (x[0], x[1], u / (x[2] - 1)))
     x, u = state64([[0.0, 0.0], [0.0, 0.0], [2.0, 1.0]]), row64([1.0, 1.0])
     end = RK4().step(own, x, u, 0.1)
     with pytest.raises(InputError, match=r"gave .*inf.* for vehicle 1"):
         RK4().check(own, x, end, u, 0.1)
     RK4().check(Dubins(), x, end, u, 0.1)  # ours cannot fail, so nobody waits
-
-
-def test_trial_does_not_mind_kinks():
-    own = FunctionDynamics(lambda x, u: (dr.abs(x[0]), dr.maximum(x[1], 0), u))
-    start = state64([[0.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
-    require_model("own", own, start, row64([0.1, 0.2]))

@@ -2,7 +2,6 @@ from .bayesian import BayesianSearch as BayesianSearch
 from .blocks import BlockSearch as BlockSearch
 from .evolution import EvolutionSearch as EvolutionSearch
 from .low_frequency import LowFrequency as LowFrequency
-from .prior import PriorSearch as PriorSearch
 from .random_looks import RandomLooks as RandomLooks
 from .random_looks import RandomSearch as RandomSearch
 from .search import AbstractSearch as AbstractSearch

@@ -60,7 +60,6 @@ class Constraints:
     total_variation: NonNegative = 0.0
 
     def __post_init__(self) -> None:
-        """Check the order of range and boxes."""
         lowest = max(self.lowest or 0.0, MARGIN)
         highest = min(1.0 if self.highest is None else self.highest, 1 - MARGIN)
         named = f"lowest: {self.lowest}, highest: {self.highest}"

@@ -6,9 +6,9 @@ import json
 import os
 import tempfile
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from mi_nerfattack.capture.colmap.process import PARTS, POINTS, RESULT
 from mi_nerfattack.capture.posed_images import PosedImages, differing, load_images
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
+from mi_nerfattack.io.positions import require_near
 from mi_nerfattack.render.camera.conventions import (
     COLMAP_MODELS,
     colmap_to_opencv,
@@ -83,18 +84,18 @@ def read_colmap(
     found = _find_images(root, model, [record.name for record in records])
     missing = tuple(record.name for record in records if record.name not in found)
     if missing and not skip_missing:
-        raise InputError(
-            f"{where}: {len(missing)} of {len(records)} images are missing, first "
-            f"{missing[0]!r} in {next(iter(found.values())).parent}; restore them or "
-            "leave them out (--skip-missing, or skip_missing=True)"
-        )
+        _refuse_missing(where, missing, len(records), found)
     used = [record for record in records if record.name in found]
     paths = [found[record.name] for record in used]
     lenses = [cameras[record.camera_id] for record in used]
+    poses = colmap_to_opencv(
+        [r.quaternion for r in used], [r.translation for r in used]
+    )
+    require_near(where, poses[:, :3, 3])
     images, reduced = load_images(paths, lenses, source, long_edge_px)
     return PosedImages(
         images,
-        colmap_to_opencv([r.quaternion for r in used], [r.translation for r in used]),
+        poses,
         reduced[0],
         tuple(record.name for record in used),
         missing,
@@ -104,13 +105,24 @@ def read_colmap(
     )
 
 
+def _refuse_missing(
+    where: Path, missing: Sequence[str], count: int, found: Mapping[str, Path]
+) -> NoReturn:
+    raise InputError(
+        f"{where}: {len(missing)} of {count} images are missing, first "
+        f"{missing[0]!r} in {next(iter(found.values())).parent}; restore them or "
+        "leave them out (--skip-missing, or skip_missing=True)"
+    )
+
+
 def _find(folder: Path) -> tuple[Path, str] | None:
     """Return the folder of a model and the suffix of its files."""
     for name in MODEL_FOLDERS:
         for suffix in (".bin", ".txt"):
             needed = (folder / name / f"{part}{suffix}" for part in PARTS[:2])
-            if all(path.is_file() for path in needed):
-                return folder / name, suffix
+            with files.reported(folder / name):
+                if all(path.is_file() for path in needed):
+                    return folder / name, suffix
     return None
 
 
@@ -143,7 +155,7 @@ def _read(model: Path, suffix: str) -> tuple[dict[str, Any], np.ndarray | None]:
         raise InputError(
             f"{model / names[-1]}: a position is not finite; copy the file again"
         )
-    return found, points if len(names) > 2 else None
+    return found, points if len(points) else None
 
 
 def _cameras(source: Path, records: dict[str, Sequence[Any]]) -> dict[int, Camera]:

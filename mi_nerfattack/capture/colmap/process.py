@@ -155,6 +155,7 @@ def _reconstruct(
             ),
         )
         start += len(names)
+    _assume_fisheye(pycolmap, database)
     _match(pycolmap, database, task["matching"], count)
     models = _map(pycolmap, database, folder, task)
     found = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
@@ -167,6 +168,21 @@ def _reconstruct(
             for image in table.read_all_images()
         }
     return {**_summary(found), "features": features}
+
+
+def _assume_fisheye(pycolmap: Any, database: Path) -> None:
+    """Begin with fisheyes of 115 degrees where EXIF data say no focal length.
+
+    COLMAP finds a focal length from pairs of photographs, but not of fisheyes, which
+    it would leave out. From here, it finds those of 70 degrees and of 180.
+    """
+    with pycolmap.Database.open(database) as table:
+        for camera in table.read_all_cameras():
+            if "FISHEYE" in camera.model.name and not camera.has_prior_focal_length:
+                focal = max(camera.width, camera.height) / 2
+                camera.params = [focal, focal, *camera.params[2:]]
+                camera.has_prior_focal_length = True
+                table.update_camera(camera)
 
 
 def _end_with_parent() -> None:
@@ -200,6 +216,8 @@ def _map(pycolmap: Any, database: Path, folder: Path, task: dict[str, Any]) -> A
 
     _say(stage="poses", total=sum(map(len, task["groups"])))
     options = {"min_model_size": LEAST_IMAGES, "random_seed": task["seed"]}
+    if "FISHEYE" in task["lens"]:  # a narrow one tells k3 and k4 badly
+        options["max_extra_param"] = 10.0
     return pycolmap.incremental_mapping(
         database, folder, Path(task["work"]), options, next_image_callback=count_image
     )

@@ -17,7 +17,9 @@ from mi_nerfattack.render.camera.conventions import from_colmap
 from mi_nerfattack.render.camera.intrinsics import Camera
 
 Matching = Literal["exhaustive", "sequential"]
-Lens = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"]
+Lens = Literal[
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"
+]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,24 +1,29 @@
 """glTF files made ready for trimesh, and what trimesh does not read of them.
 
 trimesh takes no notice of samplers, second sets of texture coordinates,
-`KHR_texture_transform`, sparse or normalised accessors and compressed geometry. What
-changes the picture is either handed on (`BaseColour`) or refused by name here.
+`KHR_texture_transform`, sparse, normalised or quantised accessors, skins, instances and
+morphing. What changes the picture is handed on (`BaseColour`), decoded into plain
+accessors, or refused by name here: so is every extension of nodes, meshes or their data
+that is not known, whether the file requires it or only uses it.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mi_nerfattack.capture.mesh.nodes import place_meshes
+from mi_nerfattack.capture.mesh.accessors import Accessors
+from mi_nerfattack.capture.mesh.nodes import INSTANCES, place_meshes
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
-from mi_nerfattack.io.strict_json import parse_json
+from mi_nerfattack.io.strict import parse_json
+from mi_nerfattack.system.extras import install_hint
 
 MAX_BYTES = 1 << 30
 #: Name under which the prepared JSON asks for the binary chunk of a .glb file.
@@ -28,13 +33,25 @@ _GLB, _JSON, _BIN = b"glTF", b"JSON", b"BIN\0"
 _WRAPS = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _FLOAT, _UBYTE, _USHORT, _UINT = 5126, 5121, 5123, 5125
+#: Component types that trimesh reads; others are decoded.
+_KINDS = {
+    "POSITION": (_FLOAT,),
+    "NORMAL": (_FLOAT,),
+    "TEXCOORD_0": (_FLOAT,),
+    "COLOR_0": (_FLOAT, _UBYTE, _USHORT),
+    "indices": (_UBYTE, _USHORT, _UINT),
+}
 _GLOSS = "KHR_materials_pbrSpecularGlossiness"
+_DRACO = "KHR_draco_mesh_compression"
 _SUPPORTED = frozenset(
     {
         "EXT_texture_webp",
         _GLOSS,
         "KHR_texture_transform",
         # without these gloss, light or choices are lost, but no diffuse colour
+        "EXT_instance_features",
+        "EXT_mesh_features",
+        "EXT_structural_metadata",
         "KHR_lights_punctual",
         "KHR_materials_anisotropy",
         "KHR_materials_clearcoat",
@@ -46,9 +63,15 @@ _SUPPORTED = frozenset(
         "KHR_materials_specular",
         "KHR_materials_unlit",
         "KHR_materials_variants",
+        "KHR_mesh_quantization",
         "KHR_xmp_json_ld",
+        "MSFT_lod",
+        _DRACO,
+        INSTANCES,
     }
 )
+#: Where an extension may change geometry.
+_GEOMETRY = ("nodes", "meshes", "accessors", "bufferViews", "buffers", "skins")
 _WHITE = {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1]}}
 
 
@@ -78,34 +101,40 @@ class PreparedGltf:
     Attributes:
         data: the JSON; materials are named by their index, and every primitive has
             one, whose base colour reads the texture coordinates of set 0.
-        chunks: binary data by the name that `data` gives it.
         base_colours: one for each material.
     """
 
     data: bytes
-    chunks: Mapping[str, bytes]
     base_colours: tuple[BaseColour, ...]
 
 
-def prepare(path: Path) -> PreparedGltf:
+def prepare(
+    path: Path, chunks: dict[str, bytes], load: Callable[[str], bytes]
+) -> PreparedGltf:
     """Read a .glb or .gltf file as JSON and check what trimesh would pass over.
 
+    Args:
+        path: the file.
+        chunks: gets binary data by the name that the JSON gives it.
+        load: returns one of `chunks`, or a file beside.
+
     Raises:
+        FileNotFoundError: by `load`.
         InputError: the file is not glTF 2.0 or is damaged, or uses what is not
             supported; the message names it.
     """
     raw = files.read_bytes(path, MAX_BYTES)
-    chunks: dict[str, bytes] = {}
     if path.suffix.lower() == ".glb":
         raw, binary = _chunks(path, raw)
         if binary is not None:
             chunks[BINARY_CHUNK] = binary
     try:
         tree = parse_json(path, raw.decode("utf-8-sig"))
-        colours = _prepare_tree(path, tree, bool(chunks))
-        place_meshes(path, tree)
+        accessors = Accessors(tree, load, chunks)
+        colours = _prepare_tree(path, tree, bool(chunks), accessors)
+        place_meshes(path, tree, accessors)
         data = json.dumps(tree).encode()
-    except InputError:
+    except (InputError, FileNotFoundError):
         raise
     # a damaged tree makes raise whatever is missing or of another type
     except Exception as error:
@@ -113,7 +142,7 @@ def prepare(path: Path) -> PreparedGltf:
             f"{path}: not a valid glTF file ({type(error).__name__}: {error}); "
             "export the mesh again"
         ) from error
-    return PreparedGltf(data, chunks, colours)
+    return PreparedGltf(data, colours)
 
 
 def _chunks(path: Path, raw: bytes) -> tuple[bytes, bytes | None]:
@@ -138,16 +167,21 @@ def _chunks(path: Path, raw: bytes) -> tuple[bytes, bytes | None]:
     return found[0][1], found[1][1] if is_binary else None
 
 
-def _prepare_tree(path: Path, tree: Any, has_chunk: bool) -> tuple[BaseColour, ...]:
+def _prepare_tree(
+    path: Path, tree: Any, has_chunk: bool, accessors: Accessors
+) -> tuple[BaseColour, ...]:
     if not str(tree["asset"]["version"]).startswith("2"):
         raise InputError(
             f"{path}: asset.version is {tree['asset']['version']}; only glTF 2 is read"
         )
-    unknown = set(tree.get("extensionsRequired", ())) - _SUPPORTED
-    if unknown:
+    used = set(tree.get("extensionsRequired", ()))
+    for item in (x for key in _GEOMETRY for x in tree.get(key, ())):
+        for part in (item, *item.get("primitives", ())):
+            used |= set(part.get("extensions", ()))
+    if unknown := used - _SUPPORTED:
         raise InputError(
-            f"{path}: requires {', '.join(sorted(unknown))}, which is not supported; "
-            "export the mesh without it (uncompressed, not quantised)"
+            f"{path}: uses {', '.join(sorted(unknown))}, which is not supported and "
+            "may change what it shows; export the mesh without it (uncompressed)"
         )
     for i, buffer in enumerate(tree.get("buffers", ())):
         if "uri" in buffer:
@@ -161,7 +195,7 @@ def _prepare_tree(path: Path, tree: Any, has_chunk: bool) -> tuple[BaseColour, .
     for i, mesh in enumerate(tree.get("meshes", ())):
         for j, primitive in enumerate(mesh["primitives"]):
             where = f"{path}: meshes[{i}].primitives[{j}]"
-            _prepare_primitive(where, tree, primitive, colours)
+            _prepare_primitive(where, tree, primitive, colours, accessors)
     for i, material in enumerate(materials):
         material["name"] = str(i)
     return colours
@@ -210,7 +244,11 @@ def _matrix(info: Any) -> np.ndarray:
 
 
 def _prepare_primitive(
-    where: str, tree: Any, primitive: Any, colours: tuple[BaseColour, ...]
+    where: str,
+    tree: Any,
+    primitive: Any,
+    colours: tuple[BaseColour, ...],
+    accessors: Accessors,
 ) -> None:
     mode = primitive.get("mode", _TRIANGLES)
     if mode == _FAN:
@@ -227,37 +265,37 @@ def _prepare_primitive(
                 "with texture coordinates"
             )
         attributes["TEXCOORD_0"] = attributes[name]
-    kinds = {
-        "POSITION": (_FLOAT,),
-        "NORMAL": (_FLOAT,),
-        "TEXCOORD_0": (_FLOAT,),
-        "COLOR_0": (_FLOAT, _UBYTE, _USHORT),
-    }
-    used = {name: attributes[name] for name in kinds if name in attributes}
-    if "indices" in primitive:
-        used["indices"] = primitive["indices"]
-    for name, index in used.items():
-        allowed = kinds.get(name, (_UBYTE, _USHORT, _UINT))
-        _check_accessor(where, name, tree["accessors"][index], allowed)
+    if _is_draco(where, tree, primitive):
+        return  # trimesh decodes it
+    for name, kinds in _KINDS.items():
+        holder = primitive if name == "indices" else attributes
+        if name in holder:
+            accessor = tree["accessors"][holder[name]]
+            if "sparse" in accessor or accessor["componentType"] not in kinds:
+                rows = accessors.read(holder[name])
+                holder[name] = accessors.add(rows, is_whole=name == "indices")
+
+
+def _is_draco(where: str, tree: Any, primitive: Any) -> bool:
+    """Tell whether a primitive has only compressed data, which can be read."""
+    used = [*primitive["attributes"].values()]
+    used += [primitive["indices"]] if "indices" in primitive else []
+    stored = [{"bufferView", "sparse"} & {*tree["accessors"][i]} for i in used]
+    extensions = primitive.get("extensions", {})
+    if _DRACO not in extensions or all(stored):
+        extensions.pop(_DRACO, None)
+        if not all(stored):
+            raise InputError(f"{where}: has no data; export the mesh again")
+        return False
+    if find_spec("DracoPy") is None:
+        raise InputError(
+            f"{where}: is compressed by {_DRACO}, which needs DracoPy: "
+            f"{install_hint('formats')}; or export the mesh uncompressed"
+        )
+    return True
 
 
 def _coordinate_set(material: Any) -> int:
     info = _base_texture(material)
     transform = info.get("extensions", {}).get("KHR_texture_transform", {})
     return int(transform.get("texCoord", info.get("texCoord", 0)))
-
-
-def _check_accessor(
-    where: str, name: str, accessor: Any, allowed: tuple[int, ...]
-) -> None:
-    if "sparse" in accessor or "bufferView" not in accessor:
-        raise InputError(
-            f"{where}: {name} is stored sparse or compressed, which is not supported; "
-            "export the mesh uncompressed"
-        )
-    if accessor["componentType"] not in allowed:
-        raise InputError(
-            f"{where}: {name} has component type {accessor['componentType']}, which "
-            "is not supported (KHR_mesh_quantization, normalised texture "
-            "coordinates); export it as floating point"
-        )

@@ -21,9 +21,12 @@ from mi_nerfattack.capture.mesh.mesh import MeshPart, TexturedMesh
 from mi_nerfattack.capture.mesh.texture import flat_texture, laid_out
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
+from mi_nerfattack.io.positions import require_near
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
 _FARTHEST = 1e12
+#: Farther from the origin, single precision moves vertices by 1/1000 of the mesh.
+_EXTENTS = 1e4
 #: Rotations that bring an axis of a file to z; "y" keeps x and makes +z our -y.
 _TO_Z_UP = {
     "x": [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
@@ -38,9 +41,11 @@ _TO_Z_UP = {
 def load_mesh(path: str | Path, up: str | None = None) -> TexturedMesh:
     """Read glTF (.glb, .gltf), OBJ or PLY with its diffuse colours.
 
-    Node transforms are applied. Colours of glTF materials and vertices are linear,
-    those of OBJ and PLY sRGB, textures always sRGB. Opacity counts where glTF says
-    MASK or BLEND, but for that of vertices. Metal, gloss and emission are left out.
+    Node transforms are applied, and meshes with a skin or instances lie where their
+    joints or instances put them, without animation. Colours of glTF materials and
+    vertices are linear, those of OBJ and PLY sRGB, textures always sRGB. Opacity counts
+    where glTF says MASK or BLEND, but for that of vertices. Metal, gloss and emission
+    are left out.
 
     Args:
         path: the mesh; textures lie where it says, in its folder or below.
@@ -56,20 +61,23 @@ def load_mesh(path: str | Path, up: str | None = None) -> TexturedMesh:
 
     path = Path(path)
     suffix = path.suffix.lower()
-    if not path.exists():
-        raise InputError(f"{path}: does not exist; check the path")
+    with files.reported(path):
+        path.stat()
     if suffix not in SUFFIXES:
         raise InputError(f"{path}: unknown suffix; use {', '.join(SUFFIXES)}")
     turn = up_matrix(up or ("z" if suffix == ".ply" else "y"))
     base_colours: tuple[BaseColour, ...] = ()
-    chunks: Mapping[str, bytes] = {}
+    chunks: dict[str, bytes] = {}
+    resolver = _recording_resolver(path, chunks)
     if suffix in (".glb", ".gltf"):
-        prepared = prepare(path)
-        data, kind = prepared.data, "gltf"
-        base_colours, chunks = prepared.base_colours, prepared.chunks
+        try:
+            prepared = prepare(path, chunks, resolver.get)
+        except FileNotFoundError:
+            _refuse_missing(path, resolver)
+            raise
+        data, kind, base_colours = prepared.data, "gltf", prepared.base_colours
     else:
         data, kind = files.read_bytes(path, MAX_BYTES), suffix[1:]
-    resolver = _recording_resolver(path, chunks)
     if kind == "obj":
         data = _as_utf8(data)
         _check_materials(path, data, resolver)
@@ -107,6 +115,7 @@ def _checked(path: Path, parts: tuple[MeshPart, ...]) -> TexturedMesh:
     mesh = TexturedMesh(path.name, parts)
     if not np.all(np.abs(mesh.bounds) < _FARTHEST):  # also where it is NaN
         raise InputError(f"{path}: a vertex is NaN, infinite or beyond {_FARTHEST:g}")
+    require_near(path, mesh.bounds, _EXTENTS)  # of any unit: it is scaled and centred
     if mesh.area <= 0:
         raise InputError(
             f"{path}: all its triangles are degenerate (without area); export a "

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from mi_nerfattack.capture.colmap.follow import StageCallback
 from mi_nerfattack.capture.colmap.reconstruct import Structure
 from mi_nerfattack.capture.photographs.markers import Markers, find_markers
+from mi_nerfattack.capture.photographs.staging import copied
 from mi_nerfattack.capture.photographs.tracked import HandEye, Tracked, fit_tracked
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Positive, checked
@@ -89,7 +90,7 @@ def align(
 
 def _between(found: Structure, distance: Distance) -> float:
     places = []
-    for name in (distance.first, distance.second):
+    for name in map(copied, (distance.first, distance.second)):
         if name not in found.names:
             raise InputError(
                 f"distance: {name!r} is not one of the {len(found.names)} photographs "

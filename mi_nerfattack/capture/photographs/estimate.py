@@ -64,7 +64,6 @@ class PoseOptions:
     seed: Seed = 0
 
     def __post_init__(self) -> None:
-        """Check that at most one thing tells the scale."""
         told = [
             name
             for name in ("metres_per_unit", "distance", "markers", "tracked")
@@ -118,9 +117,9 @@ def estimate_poses(
     which. Photographs that their EXIF data turn are stored upright.
 
     Args:
-        photographs: folder of at least 3 JPEG, PNG or WebP images; at least 3 of each
-            camera, of each of its focal lengths, and of each way that it was held.
-            Their EXIF data and sizes tell these apart.
+        photographs: folder of at least 3 JPEG, PNG, WebP or HEIC images; at least 3 of
+            each camera, of each of its focal lengths, and of each way that it was held.
+            Their EXIF data and sizes tell these apart. A.heic becomes A.heic.jpg.
         output: folder for `transforms.json`, `images`, `masks` if there are any,
             `points.safetensors`, and `capture.json`, which says what each photograph
             gave.
@@ -144,6 +143,7 @@ def estimate_poses(
             each.mkdir()
         groups = stage(root, names, staged, progress)
         check_in_place(root, names, staged, Path(output) / "images")
+        names = sorted(name for group in groups.values() for name in group)
         if options.masks is not None:
             stage_masks(options.masks, staged, names, masks)
         found = reconstruct(

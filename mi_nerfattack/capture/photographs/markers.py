@@ -14,7 +14,7 @@ from mi_nerfattack.capture.colmap.reconstruct import Structure
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.ranges import Positive, checked
-from mi_nerfattack.render.camera.distortion import distort, undistort
+from mi_nerfattack.render.camera.distortion import direction, undistort
 from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.system.extras import load_extra
 
@@ -58,7 +58,6 @@ class Markers:
     flat: bool = False
 
     def __post_init__(self) -> None:
-        """Check the family."""
         if self.family not in FAMILIES:
             raise InputError(
                 f"markers: {self.family!r}; must be one of {', '.join(FAMILIES)}"
@@ -217,21 +216,19 @@ def _meet(
     eyes = poses[:, :3, 3]
     start = np.linalg.solve(across.sum(0), (across @ eyes[..., None]).sum(0)[:, 0])
 
+    focal = np.array([(camera.fx + camera.fy) / 2 for camera in cameras])[:, None]
+
     def off(point: np.ndarray) -> np.ndarray:
-        local = np.einsum("nij,ni->nj", poses[:, :3, :3], point - eyes)
-        shown = [_pixel(camera, p) for camera, p in zip(cameras, local, strict=True)]
-        return (np.array(shown) - pixels).ravel()
+        toward = point - eyes  # as angles, since a fisheye sees what is behind it
+        toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+        return (focal * (toward - rays)).ravel()
 
     return least_squares(off, start, loss="cauchy", f_scale=_OFF_PX, x_scale="jac").x
 
 
 def _ray(camera: Camera, pixel: np.ndarray) -> np.ndarray:
     x, y = (pixel - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    direction = np.array([*undistort(x, y, *camera.distortion), 1.0])
-    return direction / np.linalg.norm(direction)
-
-
-def _pixel(camera: Camera, local: np.ndarray) -> tuple[float, float]:
-    x, y = local[:2] / max(local[2], 1e-9)
-    x, y = distort(x, y, *camera.distortion)
-    return camera.fx * x + camera.cx, camera.fy * y + camera.cy
+    if camera.is_fisheye:  # sees backwards, too
+        return np.array(direction(x, y, *camera.distortion[:4]))
+    ray = np.array([*undistort(x, y, *camera.distortion), 1.0])
+    return ray / np.linalg.norm(ray)

@@ -37,7 +37,6 @@ class HeldCamera(NamedTuple):
     height: int
 
     def __str__(self) -> str:
-        """Describe it in a message."""
         parts = [" ".join((self.make, self.model)).strip()]
         parts += [f"{self.focal_mm} mm"] * bool(self.focal_mm)
         parts += [f"zoom {self.zoom}"] * bool(self.zoom)
@@ -52,11 +51,11 @@ def list_photographs(root: Path) -> list[str]:
     Raises:
         InputError: it is not a folder, or there are fewer than 3.
     """
-    if not root.is_dir():
+    with files.reported(root):
+        inside = list(root.iterdir()) if root.is_dir() else None
+    if inside is None:
         raise InputError(f"{root}: is not a folder; give the folder of the photographs")
-    names = sorted(
-        p.name for p in root.iterdir() if p.suffix.lower() in files.IMAGE_SUFFIXES
-    )
+    names = sorted(p.name for p in inside if p.suffix.lower() in files.IMAGE_SUFFIXES)
     if len(names) < LEAST_IMAGES:
         raise InputError(
             f"{root}: {len(names)} photographs "
@@ -74,11 +73,11 @@ def stage(
     Args:
         root: folder of the photographs.
         names: in it.
-        target: folder of the copies, which keep their names.
+        target: folder of the copies, which keep their names; HEIC becomes JPEG.
         progress: called with stage, done and total.
 
     Returns:
-        the names by the camera, its focal length and the way it was held.
+        the copies' names by the camera, its focal length and the way it was held.
 
     Raises:
         InputError: one cannot be read, or a camera held one way took fewer than 3.
@@ -86,11 +85,19 @@ def stage(
     groups: dict[HeldCamera, list[str]] = {}
     for done, name in enumerate(names):
         progress("photographs", done, len(names))
-        held = copy_upright(root / name, target / name)
-        groups.setdefault(held, []).append(name)
+        copy = copied(name)
+        if copy != name and copy in names:
+            raise InputError(f"{root / copy}: a copy of {name}; remove it")
+        held = copy_upright(root / name, target / copy)
+        groups.setdefault(held, []).append(copy)
     progress("photographs", len(names), len(names))
     check_groups(root, groups)
     return groups
+
+
+def copied(name: str) -> str:
+    """Return the name of a photograph's copy, which COLMAP reads."""
+    return name + ".jpg" * (Path(name).suffix.lower() in files.HEIC_SUFFIXES)
 
 
 def check_groups(root: Path, groups: Mapping[HeldCamera, Sequence[str]]) -> None:
@@ -115,6 +122,8 @@ def check_in_place(root: Path, names: Sequence[str], staged: Path, out: Path) ->
     if not (out.is_dir() and out.samefile(root)):
         return
     for name in names:
+        if not (staged / name).exists():  # HEIC, whose copy has another name
+            continue
         limit = files.MAX_IMAGE_BYTES
         if files.read_bytes(root / name, limit) != files.read_bytes(
             staged / name, limit
@@ -129,11 +138,14 @@ def copy_upright(source: Path, target: Path) -> HeldCamera:
     """Copy an image, turned if EXIF data say so; return the camera that took it."""
     height, width = files.read_image(source).shape[:2]
     raw = files.read_bytes(source, files.MAX_IMAGE_BYTES)
-    with Image.open(io.BytesIO(raw), formats=("PNG", "JPEG", "WEBP")) as image:
+    with Image.open(io.BytesIO(raw), formats=files.image_formats(source, raw)) as image:
         kind, exif = image.format, image.getexif()
         turned = ImageOps.exif_transpose(image)
         held = _held(exif, *turned.size)
-        if turned.size == (width, height) and held.orientation == 1:
+        upright = turned.size == (width, height) and held.orientation == 1
+        if kind == "HEIF":
+            kind = "JPEG"
+        elif upright:
             files.write_bytes(target, raw)
             return held
     buffer = io.BytesIO()

@@ -9,15 +9,16 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from mi_nerfattack.capture.colmap.reconstruct import Structure
+from mi_nerfattack.capture.photographs.staging import copied
 from mi_nerfattack.capture.pose_files import read_poses
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import CameraMount
+from mi_nerfattack.render.camera.pose import poses_at
 
 _LEAST = 6  # photographs that have both poses
-_GAP_S = 0.1  # between two poses that a time may lie in
 _LEAST_TURN = 0.1  # radians about a second axis, root of the mean square
 _LARGEST_TURN = 2.5  # radians, beyond which a turn's axis is uncertain
 _OUTLIER = 0.02  # metres, or radians, from which on a residual counts less
@@ -78,25 +79,19 @@ def read_tracked(path: Path, times: Mapping[str, float] | None = None) -> Tracke
     if times is None:
         if not table.names:
             raise InputError(f"{path}: its rows name no photographs; add 'file'")
-        named = zip(table.names, table.camera_to_world, strict=True)
-        return Tracked(str(path), {Path(name).name: pose for name, pose in named})
+        names = (copied(Path(name).name) for name in table.names)
+        named = zip(names, table.camera_to_world, strict=True)
+        return Tracked(str(path), dict(named))
     if table.times is None or not (np.diff(table.times) > 0).all():
         raise InputError(
             f"{path}: needs time_s in each row, increasing, in seconds from the start "
             "of the video"
         )
-    known, poses = table.times, table.camera_to_world
-    turns = Slerp(known, Rotation.from_matrix(poses[:, :3, :3]))
-    found = {}
-    for name, time in times.items():
-        after = int(np.searchsorted(known, time))
-        if not 0 < after < len(known) or known[after] - known[after - 1] > _GAP_S:
-            continue
-        pose = np.eye(4)
-        pose[:3, :3] = turns(time).as_matrix()
-        for axis in range(3):
-            pose[axis, 3] = np.interp(time, known, poses[:, axis, 3])
-        found[name] = pose
+    matrices, is_known = poses_at(
+        table.times, table.camera_to_world, np.array(list(times.values()))
+    )
+    named = zip(times, matrices, is_known, strict=True)
+    found = {name: pose for name, pose, known in named if known}
     return Tracked(str(path), found)
 
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from mi_nerfattack.experiment.sweep.cell import Cell
+    from mi_nerfattack.experiment.sweep.summary import Taken
     from mi_nerfattack.experiment.sweep.sweep import Sweep
-    from mi_nerfattack.experiment.sweep.taken import Taken
     from mi_nerfattack.system.workers import AbstractWorkers
 
 
@@ -41,17 +41,26 @@ def do_cells(
         SetupError: likewise.
     """
     from mi_nerfattack.commands.shared.progress import StageBars
+    from mi_nerfattack.experiment.checks.cost import planned_periods
+    from mi_nerfattack.experiment.sweep.summary import Taken
     from mi_nerfattack.experiment.sweep.sweep import Cells, Sweep
-    from mi_nerfattack.experiment.sweep.taken import Taken
 
+    each = {cell.kind: cell for cell in cells}
+    periods = {kind: planned_periods(cell.scenario) for kind, cell in each.items()}
+    planned = [periods[cell.kind] for cell in cells]
+    kept = 0
     with StageBars() as bars:
 
         def show(sweep: Sweep) -> None:
-            done, total = len(sweep.complete), len(cells)
-            state = f"{done}/{total}, {sweep.steps} control periods"
+            nonlocal kept
+            done = sum(planned[index] for index in sweep.complete)
+            if not sweep.steps and len(sweep.complete) == sweep.kept:
+                kept = done
+            state = f"{len(sweep.complete)}/{len(cells)}, {sweep.steps} control periods"
             if sweep.errors:
                 state += f", {len(sweep.errors)} failed"
-            bars.show("cells", done, total, state, kept=done == sweep.kept)
+            done = max(done, min(kept + sweep.steps, sum(planned)))
+            bars.show("cells", done, sum(planned), state, kept=done == kept)
 
         work = Cells(tuple(cells), folder.resolve(), cores)
         sweep = Sweep(work, show, taken or Taken())

@@ -1,4 +1,4 @@
-"""Options of ``evaluate``: where a policy drives, and how it is called."""
+"""Options of ``evaluate``: where a policy drives, and under which conditions."""
 
 from __future__ import annotations
 
@@ -6,16 +6,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mi_nerfattack.commands.shared.policy_file import is_toml, read_toml
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
     from mi_nerfattack.deploy.place import Place
     from mi_nerfattack.evaluation.identity import EnvironmentUnder
-    from mi_nerfattack.scenario.policy import AbstractPolicySection
-
-#: The policy that is evaluated where none is given.
-BUNDLED_POLICY = "bundled:policy/pilotnet.safetensors"
 
 
 @dataclass(frozen=True)
@@ -23,19 +18,17 @@ class PlaceOptions:
     """Where a policy drives."""
 
     place: str | None = None
-    """Bundled place: intersection, or room (a small car that takes steering angles).
-    That of a scenario is its own, and otherwise intersection."""
+    """Bundled place: intersection (by default) or room."""
     scene: Path | None = None
-    """Mitsuba XML of a scene of your own; needs --routes-file."""
+    """Mitsuba scene (.xml); needs --routes-file."""
     field: Path | None = None
     """Field file of the scene, for the surrogate."""
     routes_file: Path | None = None
-    """Routes, JSON."""
+    """Routes (.json), or those of CARLA's leaderboard (.xml)."""
     object: tuple[Path, ...] = ()
-    """Grid fields that stand beside the road with random textures; the bundled place's
-    by default."""
+    """Grid fields beside the road; by default the place's."""
     server: str | None = None
-    """Server of carla, and the town of --routes-file: HOST:PORT/TOWN."""
+    """CARLA's server and town, HOST:PORT/TOWN."""
 
     @property
     def bundled(self) -> str:
@@ -65,7 +58,7 @@ class PlaceOptions:
         if town is None or self.routes_file is None:
             raise InputError(
                 "--environments: carla drives along routes of a town; give --server "
-                "HOST:PORT/TOWN and --routes-file (deploy.carla.route makes routes)"
+                "HOST:PORT/TOWN and --routes-file (.json, or the leaderboard's .xml)"
             )
         if self.scene is None and (len(environments) > 1 or self.object):
             raise InputError(
@@ -93,62 +86,6 @@ class PlaceOptions:
         )
 
 
-@dataclass(frozen=True)
-class PolicyOptions:
-    """How a policy is called; a TOML file can say more, as a scenario does."""
-
-    kind: str | None = None
-    """Kind, where the suffix does not tell it: drjit, callable, ..."""
-    trust_code: bool = False
-    """Run the policy's code: FILE.py:NAME, .pt2 and .pt are programs, with all rights
-    of your account."""
-    weights_file: str | None = None
-    """Weights of a module: .safetensors or a state dict."""
-    goal: str | None = None
-    """How the goal is passed: integer, one_hot or none."""
-    goals: int | None = None
-    """Number of goals."""
-    control_scale: float | None = None
-    """Factor to the car's unit, rad/s or rad, positive to the left; 1 by default."""
-    column: int | None = None
-    """Column of the control, where the network gives several numbers."""
-
-    def section(self, policy: str | None) -> AbstractPolicySection:
-        """Return what a scenario's section [policy] would say.
-
-        Raises:
-            InputError: an option does not fit, or the TOML file is not usable.
-        """
-        from mi_nerfattack.scenario.policy import PolicySection
-        from mi_nerfattack.scenario.section import read_section
-
-        if is_toml(policy):
-            if self != PolicyOptions():
-                raise InputError(
-                    f"{policy}: says itself how the policy is called; leave out "
-                    "--kind, --trust-code, --weights-file, --goal, --goals, "
-                    "--control-scale, --column"
-                )
-            found, path = read_toml(policy)
-            values = found.get("policy")
-            if not isinstance(values, dict):
-                raise InputError(f"{policy}: has no section [policy]")
-            return read_section(f"{policy}: policy", PolicySection, values, path.parent)
-        chosen = policy or BUNDLED_POLICY
-        values = {
-            "url" if chosen.startswith(("http://", "https://")) else "file": chosen,
-            "kind": self.kind,
-            "trust_code": self.trust_code,
-            "weights_file": self.weights_file,
-            "goal": self.goal,
-            "goals": self.goals,
-            "control_scale": self.control_scale,
-            "output": self.column,
-        }
-        values = {key: value for key, value in values.items() if value is not None}
-        return read_section(f"{chosen}: policy", PolicySection, values, Path())
-
-
 def parse_conditions(
     names: tuple[str, ...], conditions: tuple[str, ...], spp: int
 ) -> tuple[EnvironmentUnder, ...]:
@@ -156,19 +93,22 @@ def parse_conditions(
 
     Args:
         names: of the environments.
-        conditions: each ``SKY`` or ``SKY:EV``.
+        conditions: times of day and exposures, see `columns.parse_condition`.
         spp: samples per pixel.
     """
     from mi_nerfattack.deploy.place import Conditions
     from mi_nerfattack.evaluation.identity import EnvironmentUnder
+    from mi_nerfattack.experiment.transfer.columns import Condition, parse_condition
 
     parsed = []
     for text in conditions:
-        sky, _, exposure = text.partition(":")
-        try:
-            parsed.append(Conditions(sky, float(exposure or 0), spp))
-        except ValueError as err:
-            raise InputError(f"--conditions: {text!r}: {err}") from err
+        condition = parse_condition(text)
+        if replace(condition, sky="day", exposure_ev=0.0) != Condition():
+            raise InputError(
+                f"--conditions: {text!r}; a card is of times of day and exposures "
+                "alone: give other conditions to transfer"
+            )
+        parsed.append(Conditions(condition.sky, condition.exposure_ev, spp))
     if not parsed or len(set(parsed)) < len(parsed):
         raise InputError(f"--conditions: {conditions}; at least one, each once")
     found = []

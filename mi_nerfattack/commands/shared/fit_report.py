@@ -8,14 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mi_nerfattack.commands.shared.progress import StageBars
-from mi_nerfattack.commands.shared.result import Result
-from mi_nerfattack.commands.shared.terminal import console
+from mi_nerfattack.commands.shared.terminal import Result, console
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from mi_nerfattack.capture.posed_images import PosedImages
-    from mi_nerfattack.commands.shared.compare_report import CompareArguments
     from mi_nerfattack.fit.options import FitProgress, FitResult
 
 
@@ -71,10 +67,8 @@ def finish(
     output: Path,
     provenance: Mapping[str, str],
     checkpoint: Path,
-    depth: np.ndarray | None = None,
-    against: CompareArguments | None = None,
 ) -> Result:
-    """Write the field and the report of its fit, compare it, and return the scores.
+    """Write the field and the report of its fit, and return the scores.
 
     Args:
         result: of the fit.
@@ -82,12 +76,7 @@ def finish(
         output: field file; the report lies beside it, see `report_folder`.
         provenance: source and settings, for the file's header.
         checkpoint: of the fit; removed when all is written.
-        depth: (n, height, width), metres along the ray, or None.
-        against: the scene to compare with; None, or one without a scene, compares
-            with nothing.
     """
-    from mi_nerfattack.commands.shared.compare_report import print_comparison
-    from mi_nerfattack.report.pages.compare import document
     from mi_nerfattack.report.pages.fit import (
         judge_fit,
         scores_table,
@@ -98,10 +87,8 @@ def finish(
 
     result.save(output, provenance)
     title = f"Fit of {output.name}"
-    page = write_fit_report(report_folder(output), result, images, depth, title)
-    comparison = None if against is None else against.run(result.field, output)
+    page = write_fit_report(report_folder(output), result, images, title)
     checkpoint.unlink(missing_ok=True)  # before a closed pipe can end this
-    more = {} if comparison is None else {"compare": document(comparison)}
 
     def show() -> None:
         out = console()
@@ -112,7 +99,5 @@ def finish(
             soft_wrap=True,
             highlight=False,
         )
-        if comparison is not None:
-            print_comparison(comparison, output)
 
-    return Result(summary(result) | more, show)
+    return Result(summary(result), show)

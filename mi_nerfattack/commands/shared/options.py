@@ -1,28 +1,22 @@
-"""Checks of options as they were given."""
+"""Options as they were given: checks of values, and the command written out again."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import shlex
+from collections.abc import Mapping
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
 
 from mi_nerfattack.errors import InputError
 
-
-def given(options: object, names: Iterable[str]) -> str | None:
-    """Return the first of some options that has another value than by default.
-
-    Args:
-        options: a dataclass of arguments, which all have defaults.
-        names: of its fields.
-
-    Returns:
-        the option as it is written (``--long-edge``); None if there is none.
-    """
-    usual = type(options)()
-    for name in names:
-        if getattr(options, name) != getattr(usual, name):
-            return _option(name)
-    return None
+Settings = Annotated[
+    tyro.conf.UseAppendAction[tuple[str, ...]],
+    tyro.conf.arg(name="set", metavar="KEY=VALUE"),
+]
+"""``--set``, which may be repeated; see `overrides.set_keys`."""
 
 
 def check_empty(path: Path) -> None:
@@ -34,6 +28,14 @@ def check_empty(path: Path) -> None:
         raise InputError(f"-o: {path}; is not an empty folder, choose another")
 
 
+def check_suffix(path: Path, *suffixes: str) -> None:
+    """Raise InputError unless a file to write has one of some suffixes."""
+    if path.suffix.lower() not in suffixes:
+        raise InputError(
+            f"-o: {path}; give a file that ends in {' or '.join(suffixes)}"
+        )
+
+
 def check_positive(options: object, *names: str) -> None:
     """Raise `InputError` unless some options are more than 0."""
     for name in names:
@@ -43,3 +45,44 @@ def check_positive(options: object, *names: str) -> None:
 
 def _option(name: str) -> str:
     return "--" + name.replace("_", "-")
+
+
+def command_line(name: str, options: Any) -> str:
+    """Write a command anew from what differs from its defaults.
+
+    Args:
+        name: of the sub-command.
+        options: the dataclass of its arguments; `policy` and `run_folders` are
+            positional. Of absolute paths, which tell about the machine alone, the last
+            part is written.
+    """
+    return " ".join(["mi-nerfattack", name, *_words(options)])
+
+
+def _words(options: Any) -> list[str]:
+    found: list[str] = []
+    for item in fields(options):
+        value = getattr(options, item.name)
+        if is_dataclass(value):
+            found += _words(value)
+        elif item.default is not MISSING and value == item.default:
+            continue
+        elif item.name in ("policy", "run_folders"):
+            found[:0] = map(_word, _parts(value))
+        elif item.name == "settings":
+            found += [part for one in value for part in ("--set", _word(one))]
+        else:
+            found.append("--" + item.name.replace("_", "-"))
+            found += [_word(part) for part in _parts(value) if part is not True]
+    return found
+
+
+def _parts(value: Any) -> list[Any]:
+    if isinstance(value, Mapping):
+        return [part for pair in value.items() for part in pair]
+    return list(value) if isinstance(value, tuple) else [value]
+
+
+def _word(value: Any) -> str:
+    text = str(value)
+    return shlex.quote(Path(text).name if Path(text).is_absolute() else text)

@@ -1,61 +1,116 @@
-"""What a policy's TOML file says besides how the policy is called."""
+"""A policy as commands take it, and what its TOML file says besides."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import TYPE_CHECKING, Any
 
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
     from mi_nerfattack.deploy.place import Place
     from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
+    from mi_nerfattack.scenario.policy import AbstractPolicySection
     from mi_nerfattack.scenario.scenario import Scenario
     from mi_nerfattack.scenario.vehicle import AbstractVehicleSection
+
+#: The policy where none is given.
+BUNDLED_POLICY = "bundled:policy/pilotnet.safetensors"
 
 
 @dataclass(frozen=True)
 class PolicyFile:
-    """A scenario, or a file with the sections of one that describe what drives.
+    """A scenario, or sections of one that describe what drives.
 
     Attributes:
+        name: for messages.
+        policy: the section [policy], if there is one.
         camera: of the section [camera].
         vehicle: the section [vehicle].
         scenario: all of it, where there is a section [scene].
     """
 
+    name: str
+    policy: AbstractPolicySection | None = None
     camera: tuple[Camera, CameraMount] | None = None
     vehicle: AbstractVehicleSection | None = None
     scenario: Scenario | None = None
 
     @classmethod
-    def read(cls, policy: str | None) -> PolicyFile:
-        """Read the file of a policy; one that is no TOML file says nothing.
+    def read(cls, policy: str | None, settings: Sequence[str] = ()) -> PolicyFile:
+        """Read a policy.
 
         Args:
-            policy: as given to `PolicyOptions.section`.
+            policy: TOML file, bundled or not; else the file or URL of a policy, which
+                counts as a TOML file with nothing but ``policy.file`` or
+                ``policy.url``; None for the bundled policy.
+            settings: keys that replace those of the file, see `overrides.set_keys`.
 
         Raises:
-            InputError: a section is not usable.
+            InputError: a key or a section is not usable.
         """
+        from mi_nerfattack.scenario.policy import PolicySection
         from mi_nerfattack.scenario.scenario import load_scenario
-        from mi_nerfattack.scenario.section import read_section
-        from mi_nerfattack.scenario.vehicle import CameraSection, VehicleSection
+        from mi_nerfattack.scenario.section import CameraSection, read_section
+        from mi_nerfattack.scenario.vehicle import VehicleSection
 
-        if not is_toml(policy):
-            return cls()
-        values, path = read_toml(policy)
-        if "scene" in values:
-            scenario, _ = load_scenario(path)
-            return cls(scenario.camera.build(), scenario.vehicle, scenario)
+        name = policy or BUNDLED_POLICY
+        path, folder, values = _read_values(name, settings)
+        if "scene" in values and "policy" in values:
+            scenario, _ = load_scenario(path, settings=settings)
+            camera, vehicle = scenario.camera.build(), scenario.vehicle
+            return cls(name, scenario.policy, camera, vehicle, scenario)
         found: dict[str, Any] = {}
-        for key, kind in (("camera", CameraSection), ("vehicle", VehicleSection)):
+        for key, kind in (
+            ("policy", PolicySection),
+            ("camera", CameraSection),
+            ("vehicle", VehicleSection),
+        ):
             if key in values:
-                name = f"{policy}: {key}"
-                found[key] = read_section(name, kind, values[key], path.parent)
+                value = values.pop(key)
+                found[key] = read_section(f"{name}: {key}", kind, value, folder)
+        if found and values and "scene" not in values:
+            raise InputError(
+                f"{name}: {', '.join(values)}: has no effect without [scene]; allowed: "
+                "policy, camera, vehicle"
+            )
         camera = found.get("camera")
-        return cls(camera and camera.build(), found.get("vehicle"))
+        return cls(
+            name, found.get("policy"), camera and camera.build(), found.get("vehicle")
+        )
+
+    @property
+    def section(self) -> AbstractPolicySection:
+        """The section [policy]; InputError where there is none."""
+        if self.policy is None:
+            raise InputError(f"{self.name}: has no section [policy]")
+        return self.policy
+
+    def control(self) -> tuple[str | None, float | None]:
+        """Return the unit of its control, and the wheelbase that its angles are for.
+
+        Each is None where nothing says it.
+
+        Raises:
+            InputError: the policy's file and the section [vehicle] differ.
+        """
+        from mi_nerfattack.scenario.policy import PilotNetSection
+        from mi_nerfattack.scenario.vehicle import CustomSection
+
+        section, vehicle = self.section, self.vehicle
+        stored = section.unit() if isinstance(section, PilotNetSection) else None
+        if vehicle is None or isinstance(vehicle, CustomSection):
+            return stored, None
+        car = vehicle.car()
+        if stored not in (None, car.control_unit):
+            raise InputError(
+                f"{self.name}: vehicle.kind: this one takes {car.control_unit}, and "
+                f"{section.source} gives {stored}; take another of them"
+            )
+        is_angle = car.control_unit == "rad"
+        return car.control_unit, round(car.wheelbase, 6) if is_angle else None
 
     def place(self, place: Place, is_chosen: bool) -> Place:
         """Return where the policy drives, with its camera and its car.
@@ -68,6 +123,8 @@ class PolicyFile:
             InputError: the scenario's surrogate is a Mitsuba scene.
         """
         if self.scenario is not None and not is_chosen:
+            from mi_nerfattack.fields.io import holds_splats
+
             scene = self.scenario.scene
             if scene.surrogate is not None:
                 raise InputError(
@@ -76,7 +133,7 @@ class PolicyFile:
                     "the policy in a file with [policy] and [camera]"
                 )
             field = None if scene.field is None else scene.field.file
-            if field and field.suffix == ".ply":
+            if field and holds_splats(field):
                 field = None
             fields = [item.field for item in self.scenario.objects]
             place = replace(
@@ -95,15 +152,37 @@ class PolicyFile:
         return place
 
 
-def is_toml(policy: str | None) -> TypeGuard[str]:
-    """Whether a policy is given as a TOML file."""
-    return policy is not None and policy.lower().endswith(".toml")
+def read_camera(name: str) -> tuple[Camera, CameraMount]:
+    """Read [camera] alone: a car's computer has no code for other sections.
+
+    Raises:
+        InputError: it is not usable, or there is none.
+    """
+    from mi_nerfattack.scenario.section import CameraSection, read_section
+
+    _, folder, values = _read_values(name)
+    if not {"camera", "scene"} & set(values):
+        raise InputError(f"{name}: has no section [camera]")
+    where, camera = f"{name}: camera", values.get("camera", {})
+    return read_section(where, CameraSection, camera, folder).build()
 
 
-def read_toml(policy: str) -> tuple[dict[str, Any], Path]:
-    """Read a policy's TOML file, bundled or not, and return where it is."""
+def _read_values(
+    name: str, settings: Sequence[str] = ()
+) -> tuple[Path, Path, dict[str, Any]]:
+    """Return a policy's file, the folder that its paths start from, and its keys."""
+    import tomlkit
+
     from mi_nerfattack.io import files
+    from mi_nerfattack.io.overrides import set_keys
+    from mi_nerfattack.io.strict import parse_toml
     from mi_nerfattack.scenes import resolve
 
-    path = resolve(policy)
-    return files.read_toml(path), path
+    path, folder = Path(name), Path()
+    if name.lower().endswith(".toml"):
+        path = resolve(name)
+        text, folder = files.read_text(path, files.MAX_TOML_BYTES), path.parent
+    else:
+        key = "url" if name.startswith(("http://", "https://")) else "file"
+        text = tomlkit.dumps({"policy": {key: name}})
+    return path, folder, parse_toml(name, set_keys(name, text, settings))

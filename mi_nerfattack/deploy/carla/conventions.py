@@ -74,11 +74,6 @@ def point_from_unreal(centimetres: ArrayLike) -> np.ndarray:
     return point_from_carla(np.asarray(centimetres, np.float64) / CENTIMETRES)
 
 
-def heading_from_carla(yaw_deg: float) -> float:
-    """Convert a yaw in degrees, clockwise, to a heading in radians in (-pi, pi]."""
-    return -math.remainder(math.radians(yaw_deg), 2 * math.pi)
-
-
 def body_from_carla(pose: CarlaPose) -> np.ndarray:
     """Convert the pose of an actor.
 

@@ -14,18 +14,22 @@ from mi_nerfattack.deploy.carla.conventions import (
     field_of_view_deg,
 )
 from mi_nerfattack.deploy.carla.drivers import (
-    AbstractCarlaDriver,
     Axles,
-    measured_body,
+    KinematicDriver,
     read_axles,
     road_height,
 )
 from mi_nerfattack.deploy.carla.session import CarlaServer, CarlaSession, load_client
 from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
-from mi_nerfattack.deploy.vehicle import checked_pose, planar_body, require_control
+from mi_nerfattack.deploy.vehicle import checked_pose, require_control
 from mi_nerfattack.deploy.views.paste import Paster
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, camera_to_body
+from mi_nerfattack.render.camera.intrinsics import (
+    Camera,
+    CameraMount,
+    camera_to_body,
+    planar_body,
+)
 from mi_nerfattack.vehicle.route.route import Route
 
 VEHICLE = "vehicle.tesla.model3"
@@ -64,7 +68,7 @@ class CarlaEnvironment(AbstractEnvironment):
         server: CarlaServer,
         camera: Camera,
         mount: CameraMount,
-        driver: AbstractCarlaDriver,
+        driver: KinematicDriver,
         period: float = 0.1,
         vehicle: str = VEHICLE,
         axles: Axles | None = None,
@@ -81,15 +85,9 @@ class CarlaEnvironment(AbstractEnvironment):
         self._paster = Paster(camera, ())
         self._cameras: CarlaCameras | None = None
         self._actor: Any = None
-        self._body = np.eye(4)
         self.session = CarlaSession(
             server, period, load_client() if api is None else api
         )
-
-    @property
-    def town_map(self) -> Any:
-        """The town's `carla.Map`, for `route_from_town`."""
-        return self.session.town_map
 
     def reset(
         self, route: Route, pose: np.ndarray | None = None, seed: int = 0
@@ -101,7 +99,6 @@ class CarlaEnvironment(AbstractEnvironment):
             self._cameras = None
             self.session.clear()
             axles, height = self._spawn(start)
-            self._used_axles = axles
             body_to_camera = axles.body_to_world(np.eye(4)) @ self._mount
             self._cameras = CarlaCameras(
                 self.session, self.camera, self._actor, body_to_camera, self._attributes
@@ -111,7 +108,6 @@ class CarlaEnvironment(AbstractEnvironment):
             for _ in range(max(1, round(_SETTLE_S / self.period))):
                 frame = self.session.tick()
             seen = self._observe(frame)
-            self.driver.release()
         return self._paster.paste(seen)
 
     def step(self, control: float) -> CameraFrame:
@@ -126,10 +122,10 @@ class CarlaEnvironment(AbstractEnvironment):
 
     @property
     def state(self) -> np.ndarray:
-        """State (m,) of the driver; x, y and heading of the rear axle come first."""
+        """State (m,) of the model; x, y and heading of the rear axle come first."""
         if self._cameras is None:
             raise InputError("environment 'carla': it has a state only after reset")
-        return self.driver.state(self._body)
+        return self.driver.vehicle.state
 
     def show(self, objects: Sequence[Any]) -> None:
         """Paste fields by depth."""
@@ -166,12 +162,10 @@ class CarlaEnvironment(AbstractEnvironment):
         return axles, height
 
     def _observe(self, frame: int) -> CameraFrame:
-        snapshot = self.session.world.get_snapshot().find(self._actor.id)
-        if snapshot is None:
+        if self.session.world.get_snapshot().find(self._actor.id) is None:
             raise InputError(
                 f"{self._vehicle}: it is gone from the world; let no other client "
                 "destroy it"
             )
-        self._body = measured_body(snapshot.get_transform(), self._used_axles)
         assert self._cameras is not None
         return self._cameras.read(frame)

@@ -1,146 +1,146 @@
-"""Routes along the lanes of a town of CARLA."""
+"""Routes of the CARLA leaderboard, along the lanes of a town."""
 
 from __future__ import annotations
 
 import heapq
 import itertools
-import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
 from mi_nerfattack.deploy.carla.cameras import read_pose
 from mi_nerfattack.deploy.carla.conventions import (
     body_from_carla,
-    heading_from_carla,
+    point_from_carla,
     point_to_carla,
 )
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
 from mi_nerfattack.vehicle.route.route import Route
 
-#: Change of heading at a junction that each turn comes nearest to, radians.
-TURNS = {"straight": 0.0, "left": math.pi / 2, "right": -math.pi / 2}
-_LOOK_AHEAD_M = 25.0  # what is ahead of a fork, to tell its branches apart
+_SPACING_M = 1.0  # between the points of a route
+_OFF_LANE_M = 5.0  # largest distance of a position from the lane that it is on
 _MAX_POINTS = 50_000
+_MAX_BYTES = 1 << 24
 
 
-def route_from_town(
-    town_map: Any,
-    api: Any,
-    start: Sequence[float],
-    *,
-    end: Sequence[float] | None = None,
-    distance_m: float | None = None,
-    turns: Sequence[str] = (),
-    spacing_m: float = 1.0,
-    name: str = "town",
-    goal: int = 0,
-    speed_ms: float = 5.0,
-) -> Route:
-    """Make a route of the centres of lanes, in the direction of traffic.
-
-    Lanes are never changed.
+@dataclass(frozen=True, eq=False)
+class TownRoute:
+    """A route of a leaderboard's file.
 
     Args:
-        town_map: `carla.Map`; `carla.Map(name, opendrive)` needs no server.
-        api: the module `carla`.
-        start: (2,) or (3,), metres, our axes; the nearest lane counts.
-        end: the same of the end, which the shortest way leads to; or
-        distance_m: length of the route, metres.
-        turns: at the forks of a route by distance, "straight", "left" or "right" each;
-            "straight" at those that follow.
-        spacing_m: between points, metres.
-        name: of the route.
-        goal: of the route.
-        speed_ms: of the route.
+        name: the attribute `id`.
+        town: the attribute `town`.
+        points: (n, 3), positions to drive past, metres, our axes; n >= 2.
+    """
+
+    name: str
+    town: str
+    points: np.ndarray
+
+
+def read_leaderboard(path: Path) -> list[TownRoute]:
+    """Read a leaderboard's file: ``<route id= town=>`` with positions or waypoints.
+
+    Version 1 has ``<waypoint x= y= z=>``, version 2 has ``<position>`` in
+    ``<waypoints>``. Scenarios and weathers are not read.
 
     Raises:
-        InputError: both or none of end and distance, no way to the end, a road that
-            ends before the distance, an unknown turn, or one without a fork.
+        InputError: no XML, no route, or a route without an id, a town or two positions.
     """
-    if (end is None) == (distance_m is None):
-        raise InputError("route_from_town: give either end or distance_m")
-    if end is not None and turns:
+    try:
+        root = ElementTree.fromstring(files.read_bytes(path, _MAX_BYTES))
+    except ElementTree.ParseError as error:
+        raise InputError(f"{path}: not XML ({error})") from error
+    found: dict[str, TownRoute] = {}
+    for element in root.iter("route"):
+        name, town = element.get("id"), element.get("town") or element.get("map")
+        where = f"{path}: route {name!r}"
+        if not name or not town or name in found:
+            raise InputError(f"{where}: needs an id of its own, and a town")
+        items = [*element.findall("waypoints/position"), *element.findall("waypoint")]
+        try:
+            points = np.array([[float(i.attrib[k]) for k in "xyz"] for i in items])
+        except (KeyError, ValueError) as error:
+            raise InputError(f"{where}: a position without x, y, z: {error}") from error
+        if len(points) < 2 or not np.isfinite(points).all():
+            raise InputError(f"{where}: needs two finite positions or more")
+        found[name] = TownRoute(name, town, point_from_carla(points))
+    if not found:
+        raise InputError(f"{path}: no <route>; give routes of the CARLA leaderboard")
+    return list(found.values())
+
+
+def town_routes(
+    path: Path,
+    town_map: Any,
+    api: Any,
+    names: Sequence[str] = (),
+    goal: int = 0,
+    speed_ms: float = 5.0,
+) -> list[Route]:
+    """Return the routes of a leaderboard's file that lie in a town.
+
+    A route follows the centres of lanes in the direction of traffic, from each position
+    to the next, and never changes lanes.
+
+    Args:
+        path: XML.
+        town_map: `carla.Map`; `carla.Map(name, opendrive)` needs no server.
+        api: the module `carla`.
+        names: ids of routes; all of the town by default.
+        goal: of the routes.
+        speed_ms: of the routes.
+
+    Raises:
+        InputError: none of the routes is in the town, an unknown name, a position
+            beside all lanes, or one that no lane leads to.
+    """
+    town = town_map.name.split("/")[-1]
+    every = read_leaderboard(path)
+    routes = {route.name: route for route in every if route.town == town}
+    if not routes:
+        towns = ", ".join(sorted({route.town for route in every}))
+        raise InputError(f"{path}: no route in {town!r}; its routes are in {towns}")
+    unknown = [name for name in names if name not in routes]
+    if unknown:
         raise InputError(
-            f"turns: {', '.join(turns)}; those of a route by distance_m: leave them "
-            "out of one to an end"
+            f"{path}: no route {unknown[0]!r} in {town!r}; it has {', '.join(routes)}"
         )
-    if not 0.1 <= spacing_m <= 10:
-        raise InputError(f"route_from_town: spacing_m {spacing_m}; 0.1 to 10 m")
-    first = _nearest(town_map, api, start)
-    if distance_m is not None:
-        waypoints = _by_distance(first, distance_m, turns, spacing_m)
-    else:
-        assert end is not None
-        waypoints = _shortest(first, _nearest(town_map, api, end), spacing_m)
-    points = np.array([_position(waypoint)[:2] for waypoint in waypoints])
+    chosen = [routes[name] for name in names or routes]
+    return [_along_lanes(path, town_map, api, each, goal, speed_ms) for each in chosen]
+
+
+def _along_lanes(
+    path: Path, town_map: Any, api: Any, route: TownRoute, goal: int, speed_ms: float
+) -> Route:
+    where, trail = f"{path}: route {route.name!r}", []
+    for index, point in enumerate(route.points):
+        place = f"{where}: position {index}, {point[:2].round(2).tolist()}"
+        waypoint = town_map.get_waypoint(api.Location(*point_to_carla(point).tolist()))
+        away = np.inf
+        if waypoint is not None:
+            away = float(np.linalg.norm(_position(waypoint)[:2] - point[:2]))
+        if away > _OFF_LANE_M:
+            raise InputError(
+                f"{place}: {away:.0f} m from the nearest lane; is {route.town} the map?"
+            )
+        if not trail:
+            trail.append(waypoint)
+        elif not _arrived(trail[-1], waypoint, _SPACING_M):
+            trail += _shortest(place, trail[-1], waypoint, _SPACING_M)[1:]
+    points = np.array([_position(waypoint)[:2] for waypoint in trail])
     moved = np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-3
     points = points[np.concatenate([[True], moved])]
-    return Route(name, goal, points, float(first.lane_width), speed_ms)
+    return Route(route.name, goal, points, float(trail[0].lane_width), speed_ms)
 
 
-def _nearest(town_map: Any, api: Any, point: Sequence[float]) -> Any:
-    values = np.asarray(point, np.float64)
-    if values.shape not in ((2,), (3,)) or not np.isfinite(values).all():
-        raise InputError(
-            f"route_from_town: point {values.tolist()}; two or three finite numbers, "
-            "metres"
-        )
-    values = point_to_carla(np.append(values, 0.0)[:3]).tolist()
-    waypoint = town_map.get_waypoint(api.Location(*values))
-    if waypoint is None:
-        raise InputError(f"route_from_town: no lane near {list(point)}")
-    return waypoint
-
-
-def _by_distance(
-    first: Any, distance_m: float, turns: Sequence[str], spacing_m: float
-) -> list[Any]:
-    for turn in turns:
-        if turn not in TURNS:
-            raise InputError(f"turn: {turn!r}; one of {', '.join(TURNS)}")
-    count = math.ceil(distance_m / spacing_m)
-    if not 1 <= count <= _MAX_POINTS:
-        raise InputError(
-            f"route_from_town: distance_m {distance_m}; more than 0 and at most "
-            f"{_MAX_POINTS * spacing_m:g} m"
-        )
-    found, rest = [first], list(turns)
-    for _ in range(count):
-        choices = found[-1].next(spacing_m)
-        if not choices:
-            raise InputError(
-                f"route_from_town: the lane ends after {spacing_m * (len(found) - 1):g}"
-                f" of {distance_m:g} m; start elsewhere or take a shorter distance"
-            )
-        if len(choices) > 1:
-            turn = rest.pop(0) if rest else "straight"
-            found.append(_branch(found[-1], choices, TURNS[turn]))
-        else:
-            found.append(choices[0])
-    if rest:
-        raise InputError(
-            f"turns: {', '.join(rest)}; the route has no fork for it within "
-            f"{distance_m:g} m: take a longer distance, or start elsewhere"
-        )
-    return found
-
-
-def _branch(here: Any, choices: Sequence[Any], turn: float) -> Any:
-    """Choose the branch whose heading after the junction is nearest to a turn."""
-    before = _heading(here)
-
-    def miss(choice: Any) -> float:
-        ahead = choice.next(_LOOK_AHEAD_M)
-        after = _heading(ahead[0] if ahead else choice)
-        return abs(math.remainder(after - before - turn, 2 * math.pi))
-
-    return min(choices, key=miss)
-
-
-def _shortest(first: Any, last: Any, spacing_m: float) -> list[Any]:
-    """Search from waypoint to waypoint (A*)."""
+def _shortest(place: str, first: Any, last: Any, spacing_m: float) -> list[Any]:
+    """Search from waypoint to waypoint (A*); `place` is for messages."""
     target = _position(last)
     order = itertools.count()
     queue: list[tuple[float, int, float, Any, Any]] = []
@@ -160,15 +160,26 @@ def _shortest(first: Any, last: Any, spacing_m: float) -> list[Any]:
             bound = way + float(np.linalg.norm(_position(choice) - target))
             heapq.heappush(queue, (bound, next(order), way, choice, trail))
     raise InputError(
-        f"route_from_town: no way from {_position(first)[:2].round(2).tolist()} to "
-        f"{target[:2].round(2).tolist()} without changing lanes; take another end"
+        f"{place}: no lane leads there from {_position(first)[:2].round(2).tolist()}; "
+        "a route never changes lanes: choose other routes by name"
     )
 
 
 def _arrived(waypoint: Any, last: Any, spacing_m: float) -> bool:
-    same_lane = (waypoint.road_id, waypoint.lane_id) == (last.road_id, last.lane_id)
-    gap = np.linalg.norm(_position(waypoint) - _position(last))
-    return same_lane and float(gap) <= 0.75 * spacing_m
+    """Tell whether no step along the lane comes nearer to the last position."""
+    gap = _distance(waypoint, last)
+    if not _same_lane(waypoint, last) or gap > 1.001 * spacing_m:
+        return False
+    ahead = [way for way in waypoint.next(spacing_m) if _same_lane(way, last)]
+    return all(_distance(way, last) >= gap for way in ahead)
+
+
+def _same_lane(waypoint: Any, other: Any) -> bool:
+    return (waypoint.road_id, waypoint.lane_id) == (other.road_id, other.lane_id)
+
+
+def _distance(waypoint: Any, other: Any) -> float:
+    return float(np.linalg.norm(_position(waypoint) - _position(other)))
 
 
 def _unroll(trail: Any) -> list[Any]:
@@ -187,7 +198,3 @@ def _key(waypoint: Any, spacing_m: float) -> tuple[int, ...]:
 
 def _position(waypoint: Any) -> np.ndarray:
     return body_from_carla(read_pose(waypoint.transform))[:3, 3]
-
-
-def _heading(waypoint: Any) -> float:
-    return heading_from_carla(waypoint.transform.rotation.yaw)

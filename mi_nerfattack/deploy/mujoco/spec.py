@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mi_nerfattack.deploy.built_in import BuiltInObject
-from mi_nerfattack.deploy.car import Car
 from mi_nerfattack.deploy.mujoco import car as mjcf_car
-from mi_nerfattack.deploy.mujoco.car import Handling
 from mi_nerfattack.deploy.mujoco.light import (
     SHADOW_RADIUS,
     SUN_DISTANCE,
@@ -20,7 +17,6 @@ from mi_nerfattack.deploy.mujoco.light import (
 )
 from mi_nerfattack.deploy.mujoco.map import add_meshes, built_in_mesh, read_meshes
 from mi_nerfattack.deploy.mujoco.module import mujoco
-from mi_nerfattack.io import files
 
 NEAR_M = 0.05
 _SHADOW_PX = 2048
@@ -55,44 +51,6 @@ def map_spec(
     add_lighting(spec, lighting)
     _set_visual(spec, np.concatenate([mesh.vertices for mesh in meshes]))
     return spec
-
-
-def world_spec(scene: Any, car: Car, handling: Handling | None = None) -> mujoco.MjSpec:
-    """Describe map and car in one model, as for MuJoCo's own viewer."""
-    spec = map_spec(scene)
-    mjcf_car.add_car(spec, car, handling or Handling())
-    return spec
-
-
-def write_mjcf(folder: str | Path, spec: mujoco.MjSpec) -> list[Path]:
-    """Write a model as MJCF: `model.xml` and its textures as PNG files.
-
-    Numbers in the XML have six digits, so that a car read from it drives a little
-    differently in the last of them.
-
-    Args:
-        folder: made where it is missing; files of these names are replaced.
-        spec: of `map_spec` or `world_spec`; it stays as it is.
-
-    Returns:
-        The files, `model.xml` last.
-    """
-    folder, written = files.make_folder(folder), []
-    copy = spec.copy()
-    for index, texture in enumerate(copy.textures):
-        name = f"texture_{index:03d}.png"
-        texels = np.frombuffer(bytes(texture.data), np.uint8)
-        shape = texture.height, texture.width, 3
-        files.write_image(folder / name, texels.reshape(shape))
-        written.append(folder / name)
-        texture.data, texture.file = b"", name
-        texture.width = texture.height = 0
-        if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
-            texture.gridsize, texture.gridlayout = [6, 1], "RLUDFB"
-    copy.modelfiledir = str(folder)
-    copy.compile()
-    files.write_text(folder / "model.xml", copy.to_xml())
-    return [*written, folder / "model.xml"]
 
 
 def _set_visual(spec: mujoco.MjSpec, vertices: np.ndarray) -> None:

@@ -15,6 +15,7 @@ from mi_nerfattack.deploy.mujoco.module import mujoco
 from mi_nerfattack.deploy.vehicle import AbstractVehicle, checked_pose, require_control
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Positive, checked
+from mi_nerfattack.vehicle.steering import steering_angle
 
 _SETTLE_S = 2.0
 _SPEED_GAIN = 2.0  # 1/s
@@ -61,7 +62,7 @@ class HeadingRate(AbstractSteering):
 
     def angle(self, control: float, speed: float, wheelbase: float) -> float:
         """Return the angle whose circle has the curvature u / v, radians."""
-        return math.atan2(wheelbase * control, speed)
+        return float(steering_angle(control, speed, wheelbase))
 
 
 @dataclass(frozen=True)
@@ -82,11 +83,6 @@ class SteeringAngle(AbstractSteering):
 
 
 _STEERING = {cls(1.0).unit: cls for cls in (HeadingRate, SteeringAngle)}
-
-
-def steering_of(car: Car) -> AbstractSteering:
-    """Return what a control means to a car."""
-    return _STEERING[car.control_unit](car.max_control)
 
 
 class MujocoVehicle(AbstractVehicle):
@@ -122,7 +118,7 @@ class MujocoVehicle(AbstractVehicle):
         timestep: float = mjcf_car.MAX_TIMESTEP,
     ) -> None:
         self.car, self.handling = car, handling or Handling()
-        self.steering = steering or steering_of(car)
+        self.steering = steering or _STEERING[car.control_unit](car.max_control)
         self.max_control = self.steering.max_control
         self.control_unit = self.steering.unit
         self._substeps = _count_substeps(period, timestep)

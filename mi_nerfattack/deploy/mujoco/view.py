@@ -15,12 +15,10 @@ from mi_nerfattack.deploy.mujoco.light import SHADOW_RADIUS, SUN_DISTANCE
 from mi_nerfattack.deploy.mujoco.module import mujoco
 from mi_nerfattack.deploy.mujoco.opengl import make_context
 from mi_nerfattack.deploy.mujoco.spec import NEAR_M, map_spec
-from mi_nerfattack.deploy.views.base import AbstractView
-from mi_nerfattack.deploy.views.paste import Paster
+from mi_nerfattack.deploy.views.paste import AbstractView
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.conventions import opencv_to_opengl
 from mi_nerfattack.render.camera.intrinsics import Camera, ray_lengths
-from mi_nerfattack.render.posed import PosedField
 
 _SKY = 0.69  # of the far plane: what MuJoCo draws as the sky is a little farther
 # Samples of a pixel. MuJoCo's textures are filtered alike in both directions, by the
@@ -74,10 +72,6 @@ class MujocoView(AbstractView):
         along = (depth * self._lengths).astype(np.float32)
         along[along > _SKY * self._window.far] = np.inf
         return self._paster.paste(CameraFrame(image, along, pose))
-
-    def show(self, objects: Sequence[PosedField]) -> None:
-        """Paste other fields."""
-        self._paster = Paster(self.camera, objects)
 
     def close(self) -> None:
         """Free what OpenGL holds."""

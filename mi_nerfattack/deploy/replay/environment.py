@@ -11,12 +11,13 @@ import numpy as np
 
 from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
 from mi_nerfattack.deploy.replay.folder import FolderRecording
-from mi_nerfattack.deploy.replay.mcap import McapRecording
+from mi_nerfattack.deploy.replay.mcap import McapRecording, McapTopics
 from mi_nerfattack.deploy.replay.recording import AbstractRecording, vehicle_states
 from mi_nerfattack.deploy.replay.video import VideoRecording
 from mi_nerfattack.deploy.vehicle import require_control
 from mi_nerfattack.deploy.views.paste import Paster
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
 from mi_nerfattack.io.video import VIDEO_SUFFIXES
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
 from mi_nerfattack.vehicle.route.route import Route
@@ -124,7 +125,11 @@ class ReplayEnvironment(AbstractEnvironment):
 
 
 def open_recording(
-    path: str | Path, camera: Camera | None, mount: CameraMount, period: float = 0.1
+    path: str | Path,
+    camera: Camera | None,
+    mount: CameraMount,
+    period: float = 0.1,
+    topics: McapTopics | None = None,
 ) -> AbstractRecording:
     """Open a folder, a video or an MCAP log.
 
@@ -133,18 +138,21 @@ def open_recording(
         camera: intrinsics, for recordings without their own.
         mount: of the camera, for poses of the vehicle.
         period: seconds between frames, for folders without times.
+        topics: of an MCAP log.
 
     Raises:
         InputError: it is not there, of another kind, or cannot be read.
     """
     source = Path(path)
-    if source.is_dir():
+    with files.reported(source):
+        is_folder = source.is_dir()
+    if is_folder:
         return FolderRecording(source, camera, mount, period)
     suffix = source.suffix.lower()
     if suffix in VIDEO_SUFFIXES:
         return VideoRecording(source, camera, mount)
     if suffix == ".mcap":
-        return McapRecording(source, camera, mount)
+        return McapRecording(source, camera, mount, topics)
     raise InputError(
         f"{source}: not a recording; give a folder, a video "
         f"({', '.join(VIDEO_SUFFIXES)}) or a log (.mcap)"

@@ -76,11 +76,12 @@ def required_camera(source: Path, own: Camera | None, given: Camera | None) -> C
 
 
 def _pose_file(folder: Path) -> Path:
-    found = [folder / name for name in _POSE_FILES if (folder / name).is_file()]
+    with files.reported(folder):
+        found = [folder / name for name in _POSE_FILES if (folder / name).is_file()]
     if not found:
         raise InputError(
             f"{folder}: no poses; looked for {', '.join(_POSE_FILES)}; estimate them "
-            f"with 'mi-nerfattack capture {folder} -o FOLDER'"
+            f"with 'mi-nerfattack capture photographs {folder} -o FOLDER'"
         )
     return found[0]
 

@@ -7,10 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mi_nerfattack.deploy.vehicle import planar_state
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, camera_to_body
-from mi_nerfattack.render.camera.pose import check_rigid
+from mi_nerfattack.io.positions import require_near
+from mi_nerfattack.render.camera.intrinsics import (
+    Camera,
+    CameraMount,
+    camera_to_body,
+    planar_state,
+)
+from mi_nerfattack.render.camera.pose import POSE_REACH_S, check_rigid, poses_at
 from mi_nerfattack.vehicle.route.polyline import LARGEST_M
 
 
@@ -32,7 +37,6 @@ class Track:
     camera_to_world: np.ndarray
 
     def __post_init__(self) -> None:
-        """Check times and poses."""
         n = len(self.times)
         if n == 0 or self.camera_to_world.shape != (n, 4, 4):
             raise InputError(
@@ -41,6 +45,7 @@ class Track:
                 "(4, 4) for each"
             )
         check_times(self.where, self.times)
+        require_near(self.where, self.camera_to_world[:, :3, 3])
         for index, matrix in enumerate(self.camera_to_world):
             check_rigid(matrix, f"{self.where}: pose of frame {index}")
             if np.abs(matrix).max() > LARGEST_M:
@@ -134,36 +139,34 @@ def checked_image(where: str, image: np.ndarray, camera: Camera) -> np.ndarray:
     return np.array(image[..., :3], order="C")
 
 
-def nearest_pose(
-    frames: str, poses: str, times: np.ndarray, pose_times: np.ndarray
+def poses_of_frames(
+    frames: str,
+    poses: str,
+    times: np.ndarray,
+    pose_times: np.ndarray,
+    matrices: np.ndarray,
 ) -> np.ndarray:
-    """Find the pose of each frame: the nearest in time, within half an interval.
+    """Return the pose of each frame, interpolated in time.
 
     Args:
         frames: where the frames are from, for messages.
         poses: where the poses are from, for messages.
         times: (n,), of the frames, seconds, increasing.
         pose_times: (m,), of the poses, seconds.
+        matrices: (m, 4, 4), the poses.
 
     Returns:
-        (n,), indices of poses.
+        (n, 4, 4).
 
     Raises:
         InputError: times of poses that do not increase, or a frame without a pose.
     """
     check_times(poses, pose_times)
-    after = np.clip(np.searchsorted(pose_times, times), 1, len(pose_times) - 1)
-    if len(pose_times) == 1:
-        after = np.zeros(len(times), int)
-    before = np.maximum(after - 1, 0)
-    is_later = pose_times[after] - times < times - pose_times[before]
-    index = np.where(is_later, after, before)
-    tolerance = 0.5 * float(np.diff(times).min()) if len(times) > 1 else 0.05
-    missing = np.flatnonzero(abs(pose_times[index] - times) > tolerance + 1e-9)
-    if len(missing):
-        frame = int(missing[0])
+    found, is_known = poses_at(pose_times, matrices, times)
+    if not is_known.all():
+        frame = int(np.argmin(is_known))
         raise InputError(
             f"{frames}: frame {frame} at {times[frame]:g} s has no pose within "
-            f"{tolerance:g} s in {poses}; add it, or take the frame out"
+            f"{POSE_REACH_S:g} s in {poses}; add poses, or take the frame out"
         )
-    return index
+    return found

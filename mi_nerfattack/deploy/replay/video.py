@@ -15,8 +15,8 @@ from mi_nerfattack.deploy.replay.recording import (
     Track,
     check_times,
     checked_image,
-    nearest_pose,
     no_depth,
+    poses_of_frames,
 )
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
@@ -34,8 +34,8 @@ class VideoRecording(AbstractRecording):
     """A video, and beside it a pose file of the same name (`drive.mp4`, `drive.csv`).
 
     Poses without times are those of the frames in their order, and as many; poses with
-    times go to the frame nearest to them, and no frame may be without. Frames are
-    decoded when they are asked for; going back starts again from the first.
+    times are interpolated, and every frame needs one within 0.1 s. Frames are decoded
+    when they are asked for; going back starts again from the first.
 
     Args:
         path: any container and codec that PyAV decodes.
@@ -112,7 +112,8 @@ class VideoRecording(AbstractRecording):
 
 def _pose_file(path: Path) -> Path:
     candidates = [path.with_suffix(suffix) for suffix in SUFFIXES]
-    found = [item for item in candidates if item.is_file()]
+    with files.reported(path):
+        found = [item for item in candidates if item.is_file()]
     if not found:
         names = ", ".join(item.name for item in candidates)
         raise InputError(f"{path}: no pose file beside it; add one of {names}")
@@ -129,4 +130,4 @@ def _assign(path: Path, table: PoseTable, times: np.ndarray) -> np.ndarray:
                 "frames; give one for each, or times"
             )
         return poses
-    return poses[nearest_pose(str(path), str(table.where), times, table.times)]
+    return poses_of_frames(str(path), str(table.where), times, table.times, poses)

@@ -78,11 +78,9 @@ class Stands:
     scale: np.ndarray
 
     def __len__(self) -> int:
-        """Count the boxes."""
         return len(self.yaw)
 
     def __getitem__(self, rows: np.ndarray | slice) -> Stands:
-        """Take some of the boxes."""
         parts = (self.centre, self.ground, self.yaw, self.scale)
         return Stands(self.shape, *(part[rows] for part in parts))
 

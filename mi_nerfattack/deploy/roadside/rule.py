@@ -54,7 +54,6 @@ class Roadside:
     view_px: Count = 12
 
     def __post_init__(self) -> None:
-        """Check the order of the ranges."""
         for low, high in (*self.scales, self.gap_m):
             if low > high:
                 raise InputError(f"Roadside: {low} to {high}; the smaller comes first")

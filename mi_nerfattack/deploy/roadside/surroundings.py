@@ -12,8 +12,8 @@ import numpy as np
 
 from mi_nerfattack.backend.arrays import upload_rows
 from mi_nerfattack.deploy.roadside.footprint import Stands, points_along
-from mi_nerfattack.deploy.views.rays import vertical_reach
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix
+from mi_nerfattack.render.pathtrace.ground import vertical_reach
 from mi_nerfattack.vehicle.route.route import Route
 
 #: What is higher, or has no surface, counts as occupied, metres.

@@ -9,8 +9,7 @@ import numpy as np
 
 from mi_nerfattack.deploy.roadside.footprint import Stands
 from mi_nerfattack.deploy.roadside.surroundings import Surroundings
-from mi_nerfattack.render.camera.distortion import distort, undistort
-from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.render.camera.projection import project
 
 _NEAREST_M = 0.1
 
@@ -76,7 +75,7 @@ def look(
     local = points @ turns.transpose(1, 0, 2).reshape(3, -1)
     local = local.reshape(*points.shape[:2], *eyes.shape)
     local -= (eyes[:, None] @ turns)[:, 0]
-    image, inside = project(surroundings.camera, local)
+    image, inside = project(surroundings.camera, local, _NEAREST_M)
     box, which, frame = np.nonzero(inside)
     eye, point = eyes[frame], points[box, which]
     open_ = surroundings.visible(eye, point) if len(box) else np.zeros(0, bool)
@@ -84,33 +83,3 @@ def look(
         mine = open_ & (box == row)
         where = image[box[mine], which[mine], frame[mine]]
         yield Seen(len(poses), frame[mine], where, eye[mine], point[mine])
-
-
-def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where points are in the image, and whether they are in it.
-
-    Args:
-        camera: intrinsics.
-        points: (..., 3), metres, in the camera's frame.
-
-    Returns:
-        (..., 2), right and down, pixels, and (...,).
-    """
-    depth = np.maximum(points[..., 2], _NEAREST_M)
-    x, y = points[..., 0] / depth, points[..., 1] / depth
-    inside = points[..., 2] > _NEAREST_M
-    if camera.is_distorted:  # beyond the image it may fold back into it
-        across, down = _border(camera)
-        inside &= (np.abs(x) <= across) & (np.abs(y) <= down)
-        x, y = distort(x, y, *camera.distortion)
-    u, v = camera.fx * x + camera.cx, camera.fy * y + camera.cy
-    inside &= (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    return np.stack([u, v], -1), inside
-
-
-def _border(camera: Camera) -> tuple[float, float]:
-    """Return the largest undistorted |x| and |y| of the image's border."""
-    u, v = np.linspace(0, camera.width, 33), np.linspace(0, camera.height, 33)
-    x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
-    x, y = undistort(x, y, *camera.distortion)
-    return float(np.abs(x).max()), float(np.abs(y).max())

@@ -12,16 +12,16 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.deploy.environment import CameraFrame
-from mi_nerfattack.deploy.kinematic import KinematicVehicle
 from mi_nerfattack.deploy.simulated import AbstractSimulation
 from mi_nerfattack.deploy.surrogate.scene import showing
+from mi_nerfattack.deploy.vehicle import KinematicVehicle
 from mi_nerfattack.deploy.views.paste import OPAQUE, require_fields
 from mi_nerfattack.render.camera.intrinsics import mount_matrix
 from mi_nerfattack.render.rays import March
-from mi_nerfattack.render.surroundings import nearest_surface
+from mi_nerfattack.render.scene_march import nearest_surface
 from mi_nerfattack.rollout.scene_sensor import SceneSensor, pose_of
 from mi_nerfattack.rollout.sensor import Observation
-from mi_nerfattack.vehicle.state import to_state
+from mi_nerfattack.vehicle.dynamics import to_state
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,50 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.backend.colour import linear_to_uint8
+from mi_nerfattack.backend.freeze import freeze_method
 from mi_nerfattack.deploy.environment import CameraFrame
-from mi_nerfattack.deploy.views.rays import PixelRays, vertical_reach
 from mi_nerfattack.render.camera.conventions import mitsuba_sensor_dict
-from mi_nerfattack.render.camera.intrinsics import ray_lengths
+from mi_nerfattack.render.camera.intrinsics import Camera, ray_lengths
+from mi_nerfattack.render.camera.lens import generate_rays, pose_arrays
 from mi_nerfattack.render.camera.outside import Overhead
+from mi_nerfattack.render.pathtrace.ground import vertical_reach
 from mi_nerfattack.render.pathtrace.views import require_colour
+from mi_nerfattack.render.rays import Rays
 from mi_nerfattack.rollout.scene_sensor import SceneSensor
-from mi_nerfattack.vehicle.state import to_state
+from mi_nerfattack.vehicle.dynamics import to_state
+
+
+class PixelRays:
+    """Rays of one image after the other; the launch is recorded once.
+
+    Args:
+        camera: intrinsics.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self.camera = camera
+        self._frozen = freeze_method(self._record, self._state)
+
+    def at(self, camera_to_world: np.ndarray) -> Rays:
+        """Make the rays of one image, row by row from the top left.
+
+        Args:
+            camera_to_world: (4, 4), OpenCV axes, metres.
+
+        Returns:
+            height * width rays without end; samples in the middle of their intervals.
+        """
+        return self._frozen(*pose_arrays(camera_to_world))
+
+    def _record(self, origin: mi.Point3f, columns: Any) -> Rays:
+        origins, directions = generate_rays(self.camera, origin, columns, 1)
+        far, middle = dr.opaque(mi.Float, dr.inf), dr.opaque(mi.Float, 0.5)
+        return Rays(origins, directions, far, middle, dr.opaque(mi.Bool, True))
+
+    def _state(self, origin: mi.Point3f, columns: Any) -> list[Any]:
+        del origin, columns
+        return [self, self.camera]
+
 
 #: What is higher is left out of the surrogate's picture, metres: from where no view
 #: was fitted, fields hold matter that no view sees.

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from mi_nerfattack.backend.colour import linear_to_uint8
 from mi_nerfattack.deploy.environment import CameraFrame
-from mi_nerfattack.deploy.views.base import AbstractView
-from mi_nerfattack.deploy.views.paste import Paster
+from mi_nerfattack.deploy.views.paste import AbstractView
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.render.pathtrace.views import ViewRenderer
-from mi_nerfattack.render.posed import PosedField
 
 #: Samples of a pixel that are added up in one order whatever the threads do.
 _PART = 16
@@ -78,10 +75,6 @@ class MitsubaView(AbstractView):
         rgb = sum(w * view.rgb for w, view in zip(weights, views, strict=True))
         gain = np.float32(2.0**self.exposure_ev)
         return np.asarray(gain * rgb), views[0].depth.copy()
-
-    def show(self, objects: Sequence[PosedField]) -> None:
-        """Paste other fields."""
-        self._paster = Paster(self.camera, objects)
 
     def close(self) -> None:
         """Nothing is held."""

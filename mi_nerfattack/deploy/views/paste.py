@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 from mi_nerfattack.backend.colour import linear_to_uint8
 from mi_nerfattack.backend.freeze import freeze_method
 from mi_nerfattack.deploy.environment import CameraFrame
-from mi_nerfattack.deploy.views.rays import PixelRays
+from mi_nerfattack.deploy.views.above import PixelRays
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.render.march import STOP, march
@@ -145,3 +146,34 @@ def _split(
         found[name] = np.where(own[..., None], whole, np.float32(0))
         found[f"{name}.Z"] = np.where(own, depth, np.inf)
     return found
+
+
+class AbstractView(ABC):
+    """Camera in a static world, moved from image to image.
+
+    Attributes:
+        camera: intrinsics.
+    """
+
+    camera: Camera
+
+    @abstractmethod
+    def render(self, camera_to_world: np.ndarray, seed: int) -> CameraFrame:
+        """Render one frame.
+
+        Args:
+            camera_to_world: (4, 4), OpenCV axes, metres.
+            seed: of the samples, in [0, 2^32).
+        """
+
+    def show(self, objects: Sequence[PosedField]) -> None:
+        """Paste radiance fields in place of those shown before.
+
+        Args:
+            objects: may be empty.
+        """
+        self._paster = Paster(self.camera, objects)
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go of what a window or a process holds."""

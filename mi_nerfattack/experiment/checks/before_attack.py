@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from mi_nerfattack.experiment.checks.ground import box_findings, ground_findings
+from mi_nerfattack.deploy.environment import CameraFrame
+from mi_nerfattack.deploy.views.above import PixelRays
 from mi_nerfattack.experiment.checks.standing import (
     lane_findings,
     meeting_findings,
@@ -15,11 +16,89 @@ from mi_nerfattack.experiment.checks.standing import (
     solids_of,
 )
 from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.render.pathtrace.ground import (
+    arc_lengths,
+    ground_findings,
+    stretches,
+    wall_findings,
+)
 from mi_nerfattack.render.pathtrace.load import load_scene
+from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.rollout.drive import OWN, Drive, departure_limit
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import World
-from mi_nerfattack.vehicle.state import to_state
+from mi_nerfattack.vehicle.dynamics import to_state
+
+#: Share by which depths of surrogate and deployment may differ in the middle.
+DEPTHS = 0.15
+
+_STANDING_M = 0.5  # what is higher above z = 0 is no ground
+_FARTHEST_M = 80.0
+_FEWEST = 100  # pixels, of which something is said
+
+
+def driven_arc(world: World) -> np.ndarray:
+    """Return places (n,) along the part of the route that is driven, metres."""
+    scenario = world.scenario
+    return arc_lengths(*scenario.drive.stretch(world.route, scenario.vehicle.dt_s))
+
+
+def box_findings(world: World) -> Iterator[str]:
+    """Tell of a route that leaves the box of the surrogate's field."""
+    arc = driven_arc(world)
+    points = world.route.pose_at(arc)[:, :2]
+    objects = world.surrogate.objects
+    layers = [item for item in world.surrogate.layers if item not in objects]
+    if len(layers) != 1 or not isinstance(layers[0], PosedField):
+        return
+    field, pose = layers[0].field, layers[0].placed
+    inside = np.column_stack(
+        [points, np.full(len(points), world.surrogate.mount.height_m)]
+    )
+    local = pose.to_local(inside)
+    out = np.any((local < field.lower) | (local > field.upper), axis=1)
+    if out.any():
+        size = pose.scale * (field.upper - field.lower)
+        place = world.scenario.scene
+        yield (
+            f"the camera leaves the box of {place.field or place.surrogate}, of "
+            f"{size[0]:.1f} x {size[1]:.1f} x {size[2]:.1f} m, "
+            f"{stretches(arc, out)} of route {world.route.name!r}: nothing is shown "
+            "there; give a field of this place, or its scene.to_world"
+        )
+
+
+def likeness_findings(
+    camera: Camera, surrogate: CameraFrame, deployment: CameraFrame, label: str
+) -> Iterator[str]:
+    """Tell of two worlds whose standing things are at other distances.
+
+    Args:
+        camera: of both frames.
+        surrogate: its frame.
+        deployment: another's, from the same pose.
+        label: of the deployment.
+    """
+    pose = deployment.camera_to_world
+    upwards = PixelRays(camera).at(pose).direction.z.numpy()
+    ours, theirs = surrogate.depth, deployment.depth
+    with np.errstate(invalid="ignore"):
+        height = pose[2, 3] + theirs * upwards.reshape(theirs.shape)
+        standing = height > _STANDING_M
+    seen = standing & np.isfinite(ours) & (theirs < _FARTHEST_M)
+    if seen.sum() < _FEWEST:
+        return
+    change = float(np.median(np.abs(np.log(ours[seen] / theirs[seen]))))
+    if change > np.log1p(DEPTHS):
+        yield (
+            f"surrogate and {label} do not show one place: at the start, half of what "
+            f"stands there is {100 * np.expm1(change):.0f} % or more nearer or farther "
+            f"in one than in the other ({np.median(ours[seen]):.1f} and "
+            f"{np.median(theirs[seen]):.1f} m in the middle); compare their pictures, "
+            "and correct the field's scene.to_world"
+        )
+
 
 #: A pixel shows an object where its texture can change the value by so much of 1; it
 #: is in view where such pixels are this share of a picture, in this share of pictures.
@@ -158,7 +237,8 @@ def route_findings(world: World) -> Iterator[str]:
     yield from box_findings(world)
     if (scene := mesh_scene(world)) is not None:
         file = world.scenario.scene.deployment.file
-        yield from ground_findings(world, scene, file.name)
+        for findings in (ground_findings, wall_findings):
+            yield from findings(world.route, driven_arc(world), scene, file.name)
 
 
 def place_findings(world: World) -> Iterator[str]:

@@ -5,34 +5,42 @@ from __future__ import annotations
 import math
 import shlex
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.deploy.driving import drive
-from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
+from mi_nerfattack.deploy.environment import (
+    AbstractEnvironment,
+    CameraFrame,
+    OpenEnvironment,
+    drive,
+    policy_image,
+)
 from mi_nerfattack.deploy.views.above import scene_above, surrogate_above
 from mi_nerfattack.deploy.views.mitsuba import MitsubaView
 from mi_nerfattack.deploy.views.paste import Paster
 from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.experiment.checks.before_attack import (
+    driven_arc,
     first_findings,
     further_findings,
+    likeness_findings,
     mesh_scene,
     place_findings,
     route_findings,
 )
 from mi_nerfattack.experiment.checks.cost import Cost, estimate
-from mi_nerfattack.experiment.checks.ground import driven_points, likeness_findings
 from mi_nerfattack.render.camera.intrinsics import from_fov, mount_matrix
 from mi_nerfattack.render.camera.outside import chase_mount
+from mi_nerfattack.render.posed import object_footprints
 from mi_nerfattack.report.plots.place import Look, Overlay, place_picture
 from mi_nerfattack.rollout.drive import OWN, Drive, departure_limit
 from mi_nerfattack.scenario.deployment import SURROGATE
-from mi_nerfattack.scenario.world import World, object_footprints
+from mi_nerfattack.scenario.world import World
 
 _LONGEST_PX = 560  # of the pictures from above
 _CHASE = 400, 200, 75.0  # pixels and field of view
@@ -61,7 +69,7 @@ class Check:
     drives: list[Drive] = field(default_factory=list)
     frames: dict[str, CameraFrame] = field(default_factory=dict)
     _period_s: dict[str, float] = field(default_factory=dict)
-    _open: tuple[str, AbstractEnvironment] | None = None
+    _open: OpenEnvironment = field(default_factory=OpenEnvironment)
 
     def run(self, drives: bool = True) -> None:
         """Find what there is to find.
@@ -82,28 +90,36 @@ class Check:
                 if label not in self.frames:
                     self._told(lambda label=label: self._environment(label))
         finally:
-            self._close()
+            self._open.close()
         base = self.frames.get(SURROGATE)
+        if base is not None and world.scenario.attack.method.needs_derivatives:
+            self._told(lambda: self._slope(base))
         for label, frame in self.frames.items():
             if label != SURROGATE and base is not None:
                 camera = world.surrogate.intrinsics
                 found = likeness_findings(camera, base, frame, label)
                 self.doubts += found
 
+    def _slope(self, frame: CameraFrame) -> None:
+        """Look whether the control has a derivative by the first image."""
+        image, goal = policy_image(frame.image), self.world.route.goal
+        _, d_image = self.world.policy.vjp(image, goal, mi.Float(1))
+        if not d_image.numpy().any():
+            self.doubts.append(
+                "the derivative of the policy's control by the first image is exactly "
+                "0; if it stays so, the attack ends after an iteration: a policy that "
+                "rounds (torch.round) or is at the limit of a clamp has no slope; "
+                'smooth it, or give attack.method.kind = "blocks"'
+            )
+
     def _environment(self, label: str) -> AbstractEnvironment:
         """Open an environment, one at a time, and look once."""
-        if self._open is None or self._open[0] != label:
-            self._close()
-            world = self.world
-            self._open = label, world.open(label)
+        world = self.world
+        environment = self._open.get(label, lambda: world.open(label))
+        if label not in self.frames:
             start, seed = world.initial[0], world.scenario.seed
-            self.frames[label] = self._open[1].reset(world.route, start, seed)
-        return self._open[1]
-
-    def _close(self) -> None:
-        if self._open is not None:
-            self._open[1].close()
-        self._open = None
+            self.frames[label] = environment.reset(world.route, start, seed)
+        return environment
 
     def _drive(self) -> None:
         try:
@@ -210,7 +226,7 @@ class Check:
 
     def _overlay(self) -> Overlay:
         world = self.world
-        scenario, (arc, _) = world.scenario, driven_points(world)
+        scenario, arc = world.scenario, driven_arc(world)
         names = [item.id for item in scenario.objects]
         posed = world.surrogate.objects
         paths = {
@@ -247,8 +263,17 @@ def duration(seconds: float) -> str:
     return f"{minutes / 60:.{0 if minutes >= 600 else 1}f} h"
 
 
-def sentences(check: Check, scenario_path: str, picture: Path | None) -> list[str]:
-    """Tell in words what was found, what it costs, and what to do next."""
+def sentences(
+    check: Check, scenario_path: str, picture: Path | None, settings: Sequence[str] = ()
+) -> list[str]:
+    """Say in words what was found, what it costs, and what to do next.
+
+    Args:
+        check: that was run.
+        scenario_path: of its scenario, as it was given.
+        picture: that was drawn, if any.
+        settings: of the command line.
+    """
     world, cost = check.world, check.cost
     period = world.scenario.vehicle.dt_s
     lines = [
@@ -268,7 +293,8 @@ def sentences(check: Check, scenario_path: str, picture: Path | None) -> list[st
     lines += [f"look at: {line}" for line in check.doubts]
     if picture is not None:
         lines.append(f"picture: {picture}")
-    words = "attack", scenario_path, "-o", f"runs/{Path(scenario_path).stem}"
+    words = ["attack", scenario_path, "-o", f"runs/{Path(scenario_path).stem}"]
+    words += [word for one in settings for word in ("--set", one)]
     command = shlex.join(("mi-nerfattack", *words))
     if check.refused:
         lines.append(

@@ -10,9 +10,10 @@ from typing import Any
 from mi_nerfattack.attack.black_box.random_looks import equal_count
 from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.rollout.adjoint import KeptBackgrounds
-from mi_nerfattack.scenario.deployment import SURROGATE
-from mi_nerfattack.scenario.world import World, build_attack
-from mi_nerfattack.system.memory import peak_memory_mb
+from mi_nerfattack.scenario.deployment import SURROGATE, labelled
+from mi_nerfattack.scenario.scenario import Scenario
+from mi_nerfattack.scenario.world import World, build_attack, driven_route
+from mi_nerfattack.system.machine import peak_memory_mb
 
 _PERIODS = 6  # of the iterations that are timed
 _KEPT_BYTES = 20  # of a sample, layer, period and pose
@@ -50,6 +51,28 @@ class Cost:
         return asdict(self)
 
 
+def planned_periods(scenario: Scenario) -> int:
+    """Return about how many control periods an attack and its drives have.
+
+    A pass back counts as a drive. It is known without a look at the scene.
+
+    Raises:
+        InputError: the route cannot be read.
+    """
+    section, runs = scenario.attack, scenario.drive.runs
+    method, vehicle = section.method, scenario.vehicle
+    route = driven_route(scenario, vehicle.motion())
+    horizon = scenario.drive.steps(route, vehicle.dt_s)
+    count = method.iterations(horizon * section.poses)
+    share = method.rendered(horizon) / horizon
+    back = float(method.needs_derivatives)
+    looks = scenario.baseline.textures or equal_count(count * share, back)
+    deployed = min(looks, scenario.baseline.deployment_textures)
+    drives = looks + 4 * runs
+    drives += len(labelled(scenario.deployment)) * (deployed + 4 * runs)
+    return round(horizon * (drives + count * share * (1 + back)))
+
+
 def estimate(world: World, drive_s: Mapping[str, float]) -> Cost:
     """Time two short iterations of the attack, and add up what all would take.
 
@@ -73,7 +96,7 @@ def estimate(world: World, drive_s: Mapping[str, float]) -> Cost:
     drives = sum(n * drive_s.get(label, 0.0) for label, n in periods.items())
     passes = count + 3  # attribution is about three more
     wall = passes * iteration + horizon * ((looks + 1) * forward + drives)
-    kept = isinstance(section.adjoint.build(), KeptBackgrounds)
+    kept = isinstance(section.adjoint, KeptBackgrounds)
     again = 1 if kept or not backward else 2
     frames = section.poses * (again * passes * rendered + (looks + 1) * horizon)
     frames += sum(periods.values()) * horizon
@@ -124,7 +147,7 @@ def _field_bytes(world: World) -> int:
 def _kept_mb(world: World) -> float:
     """Return what `kept_backgrounds` keeps for all periods but the timed ones."""
     section, sensor = world.scenario.attack, world.surrogate
-    if not isinstance(section.adjoint.build(), KeptBackgrounds):
+    if not isinstance(section.adjoint, KeptBackgrounds):
         return 0.0
     kept = _KEPT_BYTES * len(sensor.layers)
     if isinstance(sensor.integrator.composite, InterleavedComposite):

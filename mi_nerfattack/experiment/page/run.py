@@ -3,24 +3,46 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from mi_nerfattack.drives.store import read_drives
+from mi_nerfattack.drives.table import STEPS, read_csv, records
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.attribution import UNCHANGED
-from mi_nerfattack.experiment.page.scrubbers import seen_scrubbers, turntables
-from mi_nerfattack.experiment.run_folder import DRIVES, SCENARIO, read_finished
+from mi_nerfattack.experiment.run_folder import (
+    DRIVES,
+    EFFORT,
+    SCENARIO,
+    object_path,
+    read_finished,
+)
+from mi_nerfattack.fields import load_grid
 from mi_nerfattack.io import files
-from mi_nerfattack.report.pages.parts import (
+from mi_nerfattack.render.posed import PosedField, object_footprints
+from mi_nerfattack.report.pages.elements import (
     ABOVE,
     COST,
     SEEN,
+    SHOWN_CASES,
     TEXTURES,
     WHEN,
+    Pane,
     RunPart,
+    Scrubber,
+    make_pane,
 )
-from mi_nerfattack.report.pages.scrubber import Scrubber
+from mi_nerfattack.report.plots.map import overhead
+from mi_nerfattack.report.plots.strip import turntable
+from mi_nerfattack.rollout.drive import ATTACK, Drive, Lane
+from mi_nerfattack.scenario.scenario import load_scenario
+from mi_nerfattack.scenario.world import driven_route
 
 #: Files of a run folder by their titles, by section of the page.
 PICTURES: Mapping[str, Mapping[str, str]] = {
@@ -53,8 +75,8 @@ def read_run(folder: Path, label: str, repeat: str | None = None) -> RunPart:
     scenario = folder / SCENARIO
     pictures = _pictures(folder, document)
     scrubbers = {
-        SEEN: seen_scrubbers(folder, document),
-        TEXTURES: turntables(folder, document),
+        SEEN: _seen_scrubbers(folder, document),
+        TEXTURES: _turntables(folder, document),
     }
     attack = f"mi-nerfattack attack {shlex.quote(str(scenario))} -o "
     return RunPart(
@@ -70,7 +92,6 @@ def read_run(folder: Path, label: str, repeat: str | None = None) -> RunPart:
 
 
 def _pictures(folder: Path, document: Mapping[str, Any]) -> dict[str, dict[str, Path]]:
-    """Return the pictures that there are."""
     found = {
         section: {
             title: folder / name
@@ -79,7 +100,7 @@ def _pictures(folder: Path, document: Mapping[str, Any]) -> dict[str, dict[str, 
         }
         for section, names in PICTURES.items()
     }
-    if document["scenario"]["attack"]["parameters"] == "pose":
+    if document["scenario"]["attack"]["freedom"]["kind"] == "pose":
         found[WHEN] = {f"{k} ({UNCHANGED})": path for k, path in found[WHEN].items()}
     for name in document.get("replay") or {}:
         path = folder / f"controls_{name}.png"
@@ -103,29 +124,176 @@ def _missing(
     if drawn and WHEN in found:
         found[WHEN] = "The policy has no derivatives that would tell."
     if drawn and not scrubbers[SEEN]:
-        found[SEEN] = f"There are no frames; this writes them: {resume} --frames all"
+        found[SEEN] = f"There are no frames; this writes them: {resume} --pictures all"
     if not scrubbers[TEXTURES]:
         found[TEXTURES] = "The folder has no objects; a new run writes them."
     return found
 
 
 def _provenance(folder: Path) -> tuple[dict[str, str], dict[str, str]]:
-    """Return versions, and checksums of files by key; nothing without drives."""
-    for path in sorted((folder / DRIVES).glob("*.safetensors")):
-        _, about = files.read_safetensors(path, ())
-        made_with = {
-            key: value
-            for key, value in sorted(about.items())
-            if not key.startswith(("scenario.", "kept.")) and key != "format"
-        }
-        named = {
-            key: json.loads(value)
-            for key, value in sorted(about.items())
-            if key.startswith("scenario.") and '"sha256"' in value
-        }
-        digests = {
-            f"{key.removeprefix('scenario.')}: {value['file']}": value["sha256"]
-            for key, value in named.items()
-        }
-        return made_with, digests
-    return {}, {}
+    """Return versions, and checksums of files by key; nothing without them."""
+    path = folder / EFFORT
+    if not path.is_file():
+        return {}, {}
+    _, about = files.read_safetensors(path, ())
+    made_with = {
+        key: value
+        for key, value in sorted(about.items())
+        if not key.startswith(("scenario.", "kept.")) and key != "format"
+    }
+    named = {
+        key: json.loads(value)
+        for key, value in sorted(about.items())
+        if key.startswith("scenario.") and '"sha256"' in value
+    }
+    digests = {
+        f"{key.removeprefix('scenario.')}: {value['file']}": value["sha256"]
+        for key, value in named.items()
+    }
+    return made_with, digests
+
+
+MOST_FRAMES = 60
+VIEWS = 12  # of a turntable
+VIEW_PX = 256  # longer edge
+TURN_S = 4.0  # once around
+_FRAME = re.compile(r"([0-9]{4,})\.png")
+
+#: Time and signed distance from the lane's centre after each control period of a drive.
+Errors = Mapping[int, tuple[float, float]]
+
+
+def _seen_scrubbers(folder: Path, document: Mapping[str, Any]) -> list[Scrubber]:
+    """Show drives without objects, past random textures and past the attack.
+
+    There is one scrubber for each environment with frames.
+    """
+    names = [name for cases in document["routes"].values() for name in cases]
+    names += document.get("replay") or {}
+    errors = _read_errors(folder / "steps.csv")
+    period = document["scenario"]["vehicle"]["dt_s"]
+    found = [_seen(folder, name, errors, period) for name in names]
+    return [scrubber for scrubber in found if scrubber is not None]
+
+
+def _turntables(folder: Path, document: Mapping[str, Any]) -> list[Scrubber]:
+    """Show the attacked objects from all around, if any; a second for each."""
+    panes = []
+    turns = [f"{360 * k / VIEWS:.0f}°" for k in range(VIEWS)]
+    for item in document["scenario"]["objects"]:
+        path = object_path(folder, item["id"])
+        if path.is_file():
+            alt = f"{item['id']} as the attack left it, turned about the vertical"
+            views = turntable(load_grid(path), VIEWS, VIEW_PX)
+            panes.append(make_pane(item["id"], alt, views, turns))
+    title = "Objects as the attack left them"
+    return [Scrubber(title, tuple(panes), 0, TURN_S / VIEWS)] if panes else []
+
+
+def _seen(
+    folder: Path,
+    environment: str,
+    errors: Mapping[tuple[str, str], Errors],
+    period_s: float,
+) -> Scrubber | None:
+    """Show the drives of an environment; None where there are no frames."""
+    frames = {case: _frames(folder, environment, case) for case in SHOWN_CASES}
+    frames = {case: own for case, own in frames.items() if own}
+    if not frames:
+        return None
+    steps = sorted({step for own in frames.values() for step in own})
+    if len(steps) > MOST_FRAMES:
+        chosen = np.linspace(0, len(steps) - 1, MOST_FRAMES).round().astype(int)
+        steps = [steps[index] for index in chosen]
+    panes = [
+        _pane(environment, case, own, steps, errors.get((environment, case), {}))
+        for case, own in frames.items()
+    ]
+    attacked = errors.get((environment, ATTACK), {})
+    far = [abs(attacked.get(step, (0.0, 0.0))[1]) for step in steps]
+    last = (steps[-1] - steps[0]) / max(1, len(steps) - 1)
+    title = f"First drives in {environment}"
+    return Scrubber(
+        title, tuple(panes), int(np.argmax(far)), max(last * period_s, 0.05)
+    )
+
+
+def _frames(folder: Path, environment: str, case: str) -> dict[int, Path]:
+    """Return the frames of a drive by the control periods before them."""
+    own = folder / "frames" / f"{environment}_{case}"
+    found = {
+        int(match[1]): path
+        for path in (own.iterdir() if own.is_dir() else ())
+        if (match := _FRAME.fullmatch(path.name))
+    }
+    return dict(sorted(found.items()))
+
+
+def _pane(
+    environment: str,
+    case: str,
+    frames: Mapping[int, Path],
+    steps: list[int],
+    errors: Errors,
+) -> Pane:
+    """Show, at each step, the frame that is nearest."""
+    known = np.array(list(frames))
+    shown = [int(known[np.abs(known - step).argmin()]) for step in steps]
+    word = case.replace("_", " ")
+    return make_pane(
+        word,
+        f"what the policy sees in {environment}, {word}, frame by frame",
+        [files.read_image(frames[step]) for step in shown],
+        [
+            "{:.1f} s, {:+.2f} m".format(*errors[step])
+            if step in errors
+            else f"after {step} periods"
+            for step in shown
+        ],
+    )
+
+
+def _read_errors(path: Path) -> dict[tuple[str, str], dict[int, tuple[float, float]]]:
+    """Read where first drives were, by environment and case; nothing without a file."""
+    found: dict[tuple[str, str], dict[int, tuple[float, float]]] = {}
+    for row in records(read_csv(path, STEPS)) if path.is_file() else ():
+        if row["run"] == 0:
+            own = found.setdefault((row["environment"], row["case"]), {})
+            own[row["step"]] = row["time_s"], row["cross_track_m"]
+    return found
+
+
+def draw_above(path: Path, folders: Sequence[Path]) -> None:
+    """Plot the first drives of runs on one route, with the objects of all of them.
+
+    Args:
+        path: PNG file.
+        folders: of finished runs; at least one.
+
+    Raises:
+        InputError: a drive is missing or damaged, or a file that a scenario names.
+    """
+    drives: list[Drive] = []
+    footprints, grids = [], cache(load_grid)
+    scenario, _ = load_scenario(folders[0] / SCENARIO)
+    route = driven_route(scenario, scenario.vehicle.motion())
+    for folder in folders:
+        own, _ = load_scenario(folder / SCENARIO)
+        footprints += object_footprints(
+            PosedField(grids(item.field.file), item.pose)
+            for item in own.objects
+            if item.field is not None  # else it is in a scene in XML
+        )
+        routes = read_finished(folder)["routes"].values()
+        closed = {environment for cases in routes for environment in cases}
+        drives += [
+            drive
+            for drive in read_drives(folder / DRIVES)
+            if drive.run == 0
+            and drive.case in SHOWN_CASES
+            and drive.environment in closed
+        ]
+    if not drives:
+        raise InputError(f"{folders[0] / DRIVES}: no drives; they were removed")
+    limit = Lane.of(route, scenario.vehicle.width_m).wheel_m
+    overhead(path, drives, route, footprints, limit)

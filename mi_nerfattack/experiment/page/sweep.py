@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import shlex
 import tempfile
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import pandas as pd
 
+from mi_nerfattack.drives.table import records
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.experiment.page.above import draw_above
-from mi_nerfattack.experiment.page.run import read_run
+from mi_nerfattack.experiment.page.run import draw_above, read_run
 from mi_nerfattack.experiment.sweep.cell import CELLS, COMPLETE
 from mi_nerfattack.experiment.sweep.summary import read_attacks, summarise
-from mi_nerfattack.experiment.sweep.table import LABELS, RESULTS, Row, read_table
-from mi_nerfattack.report.pages.parts import SHOWN_CASES, RunPart, SweepPart
+from mi_nerfattack.experiment.sweep.table import LABELS, RESULTS, read_table
+from mi_nerfattack.report.pages.elements import SHOWN_CASES, RunPart, SweepPart
 from mi_nerfattack.rollout.drive import ATTACK
 from mi_nerfattack.scenario.deployment import SURROGATE
 
@@ -34,12 +34,10 @@ def read_sweep(
 
     Raises:
         InputError: the table or the folder of a cell is damaged.
-        SetupError: pyarrow is not installed.
     """
-    rows = read_table(folder / RESULTS)
-    cells = folder / CELLS
-    known = {row["cell"] for row in rows}
-    told = read_attacks(folder, rows)
+    table = read_table(folder / RESULTS)
+    cells, known = folder / CELLS, table["cell"].unique()
+    told = read_attacks(folder, table)
     sections = {one["cell"]: one["section"] for one in told if "section" in one}
     notes = []
     begun = [path for path in cells.glob("*/") if not (path / COMPLETE).exists()]
@@ -53,19 +51,19 @@ def read_sweep(
             f"{len(known) - len(sections)} of {len(known)} cells have no folder in "
             f"{cells}, or failed: there is nothing of them but their rows."
         )
-    attacks = _attacks(folder, rows, sections)
+    attacks = _attacks(folder, table, sections)
     return SweepPart(
         label,
-        summarise(rows, told),
+        summarise(table, told),
         attacks,
         _shown(cells, [row for row in attacks if row["cell"] in sections], on_run),
-        _pictures(cells, rows, sections, Path(tempfile.mkdtemp(dir=scratch)), notes),
+        _pictures(cells, table, sections, Path(tempfile.mkdtemp(dir=scratch)), notes),
         notes,
     )
 
 
 def _attacks(
-    folder: Path, rows: Sequence[Row], sections: Mapping[str, Any]
+    folder: Path, table: pd.DataFrame, sections: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
     """Return a row for each cell and environment, in the table's order.
 
@@ -75,28 +73,24 @@ def _attacks(
         `section` (`attack` of its scenario, None without its folder), and `repeat`, a
         command.
     """
-    groups: dict[tuple[str, str | None], list[Row]] = {}
-    for row in rows:
-        groups.setdefault((row["cell"], row["environment"]), []).append(row)
     found = []
-    for (cell, environment), own in groups.items():
-        by_case = {case: [r for r in own if r["case"] == case] for case in SHOWN_CASES}
-        name = shlex.quote(f"{cell}:{environment}:{ATTACK}:0")
-        found.append(
-            {key: own[0][key] for key in (*LABELS, "environment", "error")}
-            | {
-                "cases": {
-                    case: float(np.mean([row["cross_track_mean_m"] for row in some]))
-                    for case, some in by_case.items()
-                    if some
-                },
-                "wheel_out_s": float(
-                    np.mean([row["wheel_out_s"] for row in by_case[ATTACK]] or [0.0])
-                ),
-                "section": sections.get(cell),
-                "repeat": f"mi-nerfattack reproduce {shlex.quote(str(folder))} {name}",
-            }
-        )
+    for _, own in table.groupby(["cell", "environment"], sort=False, dropna=False):
+        [about] = records(own[[*LABELS, "environment", "error"]].head(1))
+        cases = {case: own[own["case"] == case] for case in SHOWN_CASES}
+        means = {
+            case: float(drives["cross_track_mean_m"].mean())
+            for case, drives in cases.items()
+            if len(drives)
+        }
+        attack = cases[ATTACK]["wheel_out_s"]
+        out_s = float(attack.mean()) if len(attack) else None
+        name = f"{about['cell']}:{about['environment']}:{ATTACK}:0"
+        words = ["mi-nerfattack", "reproduce", str(folder), name]
+        if about["error"] is not None:
+            words = []
+        about |= {"cases": means, "wheel_out_s": out_s}
+        about["section"] = sections.get(about["cell"])
+        found.append(about | {"repeat": shlex.join(words)})
     return found
 
 
@@ -123,22 +117,19 @@ def _shown(
 
 def _pictures(
     cells: Path,
-    rows: Sequence[Row],
-    present: Container[str],
+    table: pd.DataFrame,
+    present: Collection[str],
     scratch: Path,
     notes: list[str],
 ) -> dict[str, Path]:
     """Plot the drives of all cells of each route and method from above."""
-    groups: dict[str, dict[str, Path]] = {}
-    for row in rows:
-        if row["cell"] in present:
-            own = groups.setdefault(f"{row['route']}, {row['method']}", {})
-            own[row["cell"]] = cells / row["cell"]
     found = {}
-    for name, folders in groups.items():
+    here = table[table["cell"].isin(list(present))]
+    for (route, method), own in here.groupby(["route", "method"], sort=False):
+        name, folders = f"{route}, {method}", [cells / c for c in own["cell"].unique()]
         path = scratch / f"above_{len(found)}.png"
         try:
-            draw_above(path, list(folders.values()))
+            draw_above(path, folders)
         except InputError as err:  # scenarios name files of the machine that made them
             notes.append(f"No drives from above of {name}: {err}")
         else:

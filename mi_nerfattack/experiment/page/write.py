@@ -1,18 +1,86 @@
-"""Write the page of results."""
+"""Read folders of results, told apart by their files, and write their page."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mi_nerfattack.report.pages.parts import Parts
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.evaluation.metrics import cells
+from mi_nerfattack.experiment.page.run import read_run
+from mi_nerfattack.experiment.page.sweep import read_sweep
+from mi_nerfattack.experiment.run_folder import SCENARIO, folder_labels
+from mi_nerfattack.experiment.sweep.cell import CELLS
+from mi_nerfattack.experiment.sweep.table import RESULTS
+from mi_nerfattack.experiment.transfer.figures import DOCUMENT, QUALITY, read_document
+from mi_nerfattack.io import files
+from mi_nerfattack.report.pages.elements import Parts, RetrainPart, TransferPart
 from mi_nerfattack.report.pages.results import write_results_page
 from mi_nerfattack.report.plots import convergence as plots
 from mi_nerfattack.rollout.drive import ATTACK
 
-#: Keys of `[attack]` that limit textures, and their largest values.
+_KINDS = (
+    "give run folders of 'mi-nerfattack attack', folders of 'sweep' and 'transfer', "
+    "and NAME-retrain.json of 'retrain'"
+)
+_RETRAINED = {"policy", "runs", "held_out", "left_out", "table"}
+
+
+def read_folders(
+    paths: Sequence[Path],
+    scratch: Path,
+    on_run: Callable[[str], None] = lambda label: None,
+) -> Parts:
+    """Read finished runs, sweeps, transfers and retrainings.
+
+    Args:
+        paths: folders, and files of retrainings.
+        scratch: folder for plots that are made for the page.
+        on_run: told the label of each run before it is read, and its objects rendered.
+
+    Raises:
+        InputError: none or one twice, one is of another kind or not finished, or a
+            file is damaged.
+    """
+    if not paths or len({path.resolve() for path in paths}) < len(paths):
+        raise InputError("FOLDER: at least one, each once")
+    runs, sweeps, transfers, retrainings = [], [], [], []
+    for path, label in zip(paths, folder_labels(paths), strict=True):
+        if (path / RESULTS).is_file():
+            sweeps.append(read_sweep(path, label, scratch, on_run))
+        elif (path / DOCUMENT).is_file():
+            transfers.append(_transfer(path, label))
+        elif path.is_file():
+            retrainings.append(_retraining(path))
+        elif (path / SCENARIO).is_file():
+            on_run(label)
+            runs.append(read_run(path, label))
+        elif (path / CELLS).is_dir():
+            raise InputError(
+                f"{path}: is of a sweep of which no cell is done, {RESULTS} is "
+                "missing; the sweep's command goes on with it"
+            )
+        else:
+            raise InputError(f"{path}: holds no results; {_KINDS}")
+    return Parts(runs, sweeps, transfers, retrainings)
+
+
+def _transfer(folder: Path, label: str) -> TransferPart:
+    quality = folder / QUALITY
+    document = read_document(folder)
+    return TransferPart(label, document, quality if quality.is_file() else None)
+
+
+def _retraining(path: Path) -> RetrainPart:
+    document = files.read_json(path)
+    if not isinstance(document, dict) or not document.keys() >= _RETRAINED:
+        raise InputError(f"{path}: is not of 'mi-nerfattack retrain'; {_KINDS}")
+    return RetrainPart(path.name.removesuffix("-retrain.json"), document)
+
+
+#: Keys of `[attack.freedom]` that limit textures, and their largest values.
 _LIMITS = {"linf": 1.0, "l2": 1.0}
 
 
@@ -59,7 +127,7 @@ def _curves(parts: Parts) -> Iterator[tuple[str, str, Any]]:
     """Yield route, method and curve of every attack."""
     for run in parts.runs:
         for route in run.document["routes"]:
-            method = run.document["scenario"]["attack"]["method"]
+            method = run.document["scenario"]["attack"]["method"]["kind"]
             yield route, method, run.document.get("curve")
     for sweep in parts.sweeps:
         for attack in sweep.document["attacks"]:
@@ -74,12 +142,12 @@ def _by_limit(scratch: Path, parts: Parts) -> dict[str, Path]:
     for key, most in _LIMITS.items():
         points: dict[str, list[tuple[float, float]]] = {}
         for environment, attack, error in _attacked(parts):
-            limit = attack.get(key)
+            limit = attack["freedom"].get(key)
             at = most if limit is None else limit
             points.setdefault(environment, []).append((at, error))
         if len({at for own in points.values() for at, _ in own}) > 1:
             path = scratch / f"limit_{key}.png"
-            label = f"attack.{key}, sRGB (without one: {most:g})"
+            label = f"attack.freedom.{key}, sRGB (without one: {most:g})"
             plots.against_limit(path, label, points)
             found[f"Damage against the texture's budget, {key}"] = path
     return found
@@ -89,10 +157,10 @@ def _attacked(parts: Parts) -> Iterator[tuple[str, Mapping[str, Any], float]]:
     """Yield environment, section `attack` and mean error of every attack."""
     for run in parts.runs:
         section = run.document["scenario"]["attack"]
-        for environments in run.document["routes"].values():
-            for environment, cases in environments.items():
-                if ATTACK in cases:
-                    yield environment, section, cases[ATTACK]["cross_track_mean_m"]
+        for row in cells(run.document["routes"], "route", "environment"):
+            if ATTACK in row:
+                error = row[ATTACK]["cross_track_mean_m"]
+                yield row["environment"], section, error
     for sweep in parts.sweeps:
         for row in sweep.attacks:
             if ATTACK in row["cases"] and row["section"] is not None:

@@ -7,6 +7,7 @@ driven again by its recorded controls, which gives the frames that the policy sa
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,21 +15,97 @@ from typing import Any
 
 import numpy as np
 
-from mi_nerfattack.deploy.driving import policy_image
-from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
+from mi_nerfattack.capture.transforms import write_poses
+from mi_nerfattack.deploy.environment import (
+    AbstractEnvironment,
+    CameraFrame,
+    policy_image,
+)
 from mi_nerfattack.deploy.surrogate.environment import SurrogateEnvironment
 from mi_nerfattack.evaluation.metrics import environment_order
+from mi_nerfattack.experiment.cases import OnProgress
 from mi_nerfattack.experiment.finished import Finished, Frames
-from mi_nerfattack.experiment.pictures.recording import FrameFolder
-from mi_nerfattack.experiment.stages import OnProgress
-from mi_nerfattack.render.pathtrace.metadata import describe_lens, frame_metadata
+from mi_nerfattack.io import exr, files
+from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.render.pathtrace.views import describe_lens, frame_metadata
 from mi_nerfattack.report.plots.strip import aligned_steps, first_person_strip
 from mi_nerfattack.rollout.drive import CASES, Drive
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import Trajectory
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import Appearance, World
-from mi_nerfattack.vehicle.state import to_state
+from mi_nerfattack.vehicle.dynamics import to_state
+
+_OURS = re.compile(r"[0-9]{4,}(_input)?\.(exr|png)|transforms\.json|depth\.safetensors")
+
+
+class FrameFolder:
+    """A folder that frames are written to, each as ``STEP.exr`` and ``STEP.png``.
+
+    With ``transforms.json`` and ``depth.safetensors``, which :meth:`finish` writes, it
+    is a recording for the environment `replay`. What an earlier run left is removed.
+
+    Args:
+        path: of the folder; made.
+        camera: intrinsics of all frames.
+    """
+
+    def __init__(self, path: Path, camera: Camera) -> None:
+        self.path, self.camera = files.make_folder(path), camera
+        for found in list(self.path.iterdir()):
+            if _OURS.fullmatch(found.name):
+                found.unlink()
+        self._names: list[str] = []
+        self._times: list[float] = []
+        self._poses: list[np.ndarray] = []
+        self._depths: list[np.ndarray] = []
+
+    def add(
+        self,
+        step: int,
+        time_s: float,
+        frame: CameraFrame,
+        layers: Mapping[str, np.ndarray],
+        metadata: Mapping[str, str],
+        half: bool,
+    ) -> None:
+        """Write one frame; later ones come later.
+
+        Args:
+            step: control periods before it.
+            time_s: seconds, likewise.
+            frame: as it was seen.
+            layers: for the EXR file. Those that are called ``input.K`` and have a size
+                of their own go to ``STEP_input.exr``.
+            metadata: of the EXR files.
+            half: colour and opacity in half precision.
+        """
+        name = f"{step:04d}"
+        files.write_image(self.path / f"{name}.png", frame.image)
+        size = frame.depth.shape
+        fitting = {key: a for key, a in layers.items() if a.shape[:2] == size}
+        others = {key: a for key, a in layers.items() if key not in fitting}
+        exr.write_layers(self.path / f"{name}.exr", fitting, metadata, half)
+        if others:
+            exr.write_layers(self.path / f"{name}_input.exr", others, metadata, half)
+        self._names.append(f"{name}.png")
+        self._times.append(time_s)
+        self._poses.append(frame.camera_to_world)
+        self._depths.append(frame.depth)
+
+    def finish(self) -> None:
+        """Write what makes a recording of the frames, poses and times last."""
+        depth = np.stack(self._depths).astype(np.float32)
+        files.write_safetensors(self.path / "depth.safetensors", {"depth": depth}, {})
+        write_poses(
+            self.path / "transforms.json",
+            self._names,
+            self.camera,
+            np.stack(self._poses),
+            {"units": "metre", "depth_file": "depth.safetensors"},
+            self._times,
+        )
+
 
 STRIP_FRAMES = 6
 WORST_S = 1.0

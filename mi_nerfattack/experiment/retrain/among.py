@@ -10,13 +10,15 @@ import numpy as np
 
 from mi_nerfattack.deploy.place import Place
 from mi_nerfattack.deploy.sites import AbstractSite
+from mi_nerfattack.drives.spec import short_digest
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.evaluation.identity import section_content, short_digest
 from mi_nerfattack.experiment.run_folder import object_path
 from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.fields import load_grid
+from mi_nerfattack.fields.io import holds_splats
 from mi_nerfattack.io.resumable import differences, flatten, refuse
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.scenario.named_file import section_content
 from mi_nerfattack.scenario.policy import PilotNetSection
 from mi_nerfattack.scenario.scenario import is_within
 from mi_nerfattack.scenario.world import place_of
@@ -136,7 +138,7 @@ def found_place(attacks: Sequence[FoundAttack]) -> Place:
     scenario = first.scenario
     scene, (camera, _) = scenario.scene, scenario.camera.build()
     assert scene.field is not None  # checked by SceneSection
-    plain = scene.to_world is None and scene.field.file.suffix.lower() != ".ply"
+    plain = scene.to_world is None and not holds_splats(scene.field.file)
     place = place_of(scenario, camera, scenario.vehicle.motion())
     return replace(place, field=scene.field.file) if plain else place
 

@@ -13,7 +13,7 @@ from mi_nerfattack.experiment.sweep.sweep import Cells
 from mi_nerfattack.experiment.transfer.found import FoundAttack, read_found
 from mi_nerfattack.io import files, locks
 from mi_nerfattack.scenario.scenario import portable_text
-from mi_nerfattack.system.workers import AbstractWorkers, raise_failure
+from mi_nerfattack.system.workers import AbstractWorkers, raise_failure, tally
 
 
 def attack_anew(
@@ -42,13 +42,11 @@ def attack_anew(
         InputError: another process works in the folder, or an attack fails.
     """
     cells = tuple(_cell(found, policy) for found in attacks)
-    done = 0
+    count = tally(progress, 0, len(cells))
 
     def on_end(index: int, error: Exception | None) -> None:
-        nonlocal done
         raise_failure(index, error)
-        done += 1
-        progress(done, len(cells))
+        count(1)
 
     files.make_folder(folder)
     with locks.exclusive(folder):
@@ -68,7 +66,7 @@ def _cell(found: FoundAttack, policy: Path) -> Cell:
     return Cell(
         axis_name(found.route.name),
         axis_name(ids),
-        scenario.attack.method.method,
+        scenario.attack.method.kind,
         None,
         scenario.seed,
         portable_text(scenario, files.read_text(found.folder / SCENARIO)),

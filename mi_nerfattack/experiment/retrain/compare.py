@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from mi_nerfattack.drives.store import Store
 from mi_nerfattack.experiment.transfer.columns import make_columns
+from mi_nerfattack.experiment.transfer.figures import DRIVES, check_output, run_transfer
 from mi_nerfattack.experiment.transfer.found import FoundAttack
-from mi_nerfattack.experiment.transfer.run import DRIVES, check_output, run_transfer
-from mi_nerfattack.experiment.transfer.work import TransferWork
+from mi_nerfattack.experiment.transfer.work import TransferDrives
 from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT
 from mi_nerfattack.scenario.named_file import NamedFile
 from mi_nerfattack.system.workers import AbstractWorkers
@@ -42,7 +43,9 @@ class Comparison:
     spp: int
     folder: Path
 
-    def work(self, group: str, stage: str, policy: Path | None = None) -> TransferWork:
+    def work(
+        self, group: str, stage: str, policy: Path | None = None
+    ) -> TransferDrives:
         """Describe the drives of a group; InputError for starts that a run has seen.
 
         Args:
@@ -55,8 +58,9 @@ class Comparison:
             for found in self.groups[group]
         ]
         columns = make_columns(self.environments, ("day",), self.spp)
-        drives = self._output(group, stage) / DRIVES
-        return TransferWork(tuple(attacks), columns, _CASES, self.starts, _SEED, drives)
+        store = Store(self._output(group, stage) / DRIVES)
+        about = tuple(attacks), columns, _CASES, self.starts, _SEED
+        return TransferDrives(store, *about)
 
     def drive(
         self,
@@ -105,18 +109,20 @@ def table_rows(
     """
     rows = []
     for group, first in before.items():
-        pairs = zip(first["columns"], after[group]["columns"], strict=True)
-        for old, new in pairs:
+        for old, new in zip(first["columns"], after[group]["columns"], strict=True):
             stages = {BEFORE: old["cases"], AFTER: new["cases"]}
-            means = {
-                stage: [cases[case]["cross_track_mean_m"] for case in _CASES]
-                for stage, cases in stages.items()
-            }
-            row = {"group": group, "environment": old["environment"]}
-            row |= {"attacks": old["attacks"], **stages}
-            row["attack_to_clean"] = {
-                stage: attack / clean for stage, (clean, attack) in means.items()
-            }
-            row["clean_ratio"] = means[AFTER][0] / means[BEFORE][0]
-            rows.append(row)
+            clean, attack = (
+                {k: cases[case]["cross_track_mean_m"] for k, cases in stages.items()}
+                for case in _CASES
+            )
+            rows.append(
+                {
+                    "group": group,
+                    "environment": old["environment"],
+                    "attacks": old["attacks"],
+                    **stages,
+                    "attack_to_clean": {k: attack[k] / clean[k] for k in stages},
+                    "clean_ratio": clean[AFTER] / clean[BEFORE],
+                }
+            )
     return rows

@@ -62,7 +62,6 @@ def drive_expert(found: FoundAttack) -> Driven:
     errors, gaps = [], []
     for pose in initial_states(scenario, route, scenario.drive.runs, 0):
         vehicle.reset(pose, route.speed_ms)
-        expert.reset()
         states = [vehicle.state[:3]]
         for _ in range(found.horizon):
             vehicle.advance(float(expert.control(vehicle.state)[0]))

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -14,9 +15,8 @@ from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.claim import claimed
 from mi_nerfattack.experiment.job import Job
-from mi_nerfattack.experiment.kept_drives import SharedDrives
 from mi_nerfattack.io import files, locks
-from mi_nerfattack.io.strict_toml import parse_toml
+from mi_nerfattack.io.strict import parse_toml
 from mi_nerfattack.scenario.scenario import Scenario
 
 #: Folder of the cells, in that of the sweep.
@@ -43,6 +43,7 @@ class Cell:
         digests: of the scenario and the files that it names.
         anyway: attack although the checks before find that it proves nothing.
         pictures: write frames, plots and page, too.
+        name: of the folder, where it is not that of route to digest.
     """
 
     route: str
@@ -54,13 +55,21 @@ class Cell:
     digests: dict[str, str]
     anyway: bool = False
     pictures: bool = False
+    name: str = ""
 
     @property
     def id(self) -> str:
         """Name of the folder: no other scenario has it."""
+        if self.name:
+            return self.name
         words = [self.route, self.objects, self.method, self.budget, self.seed]
         words.append(self.digests["scenario"])
         return "-".join(str(word) for word in words if word is not None)
+
+    @property
+    def kind(self) -> tuple[Any, ...]:
+        """What cells have in common that differ in their seed alone."""
+        return self.route, self.objects, self.method, self.budget
 
     @cached_property
     def scenario(self) -> Scenario:
@@ -122,7 +131,7 @@ def run_cell(cell: Cell, sweep: Path, on_step: Callable[[], None]) -> None:
             )
         policy, frames = scenario.build_policy(), 3 if cell.pictures else None
         job = Job(scenario, cell.text, policy, output, lambda *told: on_step())
-        job.frames, job.shared = frames, SharedDrives(sweep / SHARED)
+        job.frames, job.shared = frames, sweep / SHARED
         with one_thread():
             job.run_claimed(anyway=cell.anyway)
         about = asdict(cell) | {"versions": versions()}

@@ -28,7 +28,7 @@ class Forecast:
 
     Attributes:
         cells: all.
-        folder: of the sweep; may be missing.
+        folder: of the sweep, which may be missing; None if nobody says.
         on_progress: told of a stage, units done, all units, and a remark.
         refused: why `attack` would refuse the cells of a place, a sentence each.
         doubts: what it would not refuse, and is seldom meant.
@@ -37,7 +37,7 @@ class Forecast:
     """
 
     cells: Sequence[Cell]
-    folder: Path
+    folder: Path | None
     on_progress: Callable[[str, int, int, str], None] = lambda *told: None
     refused: dict[Place, list[str]] = field(default_factory=dict)
     doubts: dict[Place, list[str]] = field(default_factory=dict)
@@ -50,8 +50,8 @@ class Forecast:
             drives: make the drives of the checks, and time the attacks; otherwise only
                 what needs none is found.
         """
-        first = {_kind(cell): cell for cell in reversed(self.cells)}
-        kinds = list(dict.fromkeys(map(_kind, self.cells)))
+        first = {cell.kind: cell for cell in reversed(self.cells)}
+        kinds = list(dict.fromkeys(cell.kind for cell in self.cells))
         period_s: dict[Place, dict[str, float]] = {}
         for number, kind in enumerate(kinds):
             cell, place = first[kind], kind[:2]
@@ -68,7 +68,7 @@ class Forecast:
 
     def _check(self, cell: Cell, place: Place, drives: bool) -> None:
         self.refused[place], self.doubts[place] = [], []
-        self.costs[_kind(cell)] = None
+        self.costs[cell.kind] = None
         try:
             check = Check(build_world(cell.scenario, cell.scenario.build_policy()))
             check.run(drives)
@@ -80,20 +80,23 @@ class Forecast:
         kept = self.doubts if cell.anyway else self.refused
         kept[place] += check.refused
         self.doubts[place] += check.doubts
-        self.costs[_kind(cell)] = check.cost
+        self.costs[cell.kind] = check.cost
 
     def _price(self, cell: Cell, period_s: dict[str, float]) -> Cost | None:
         try:
             world = build_world(cell.scenario, cell.scenario.build_policy())
             return estimate(world, period_s)
         except (InputError, SetupError) as err:
-            self.refused[_kind(cell)[:2]].append(f"{cell.method}: {err}")
+            self.refused[cell.kind[:2]].append(f"{cell.method}: {err}")
             return None
+
+    def _is_complete(self, cell: Cell) -> bool:
+        return self.folder is not None and is_complete(self.folder, cell)
 
     def document(self) -> dict[str, Any]:
         """Return all that was found, as JSON takes it."""
-        left = [cell for cell in self.cells if not is_complete(self.folder, cell)]
-        costs = [self.costs[_kind(cell)] for cell in left]
+        left = [cell for cell in self.cells if not self._is_complete(cell)]
+        costs = [self.costs[cell.kind] for cell in left]
         known = [cost for cost in costs if cost is not None]
         whole = len(known) == len(left)
         told = {
@@ -106,7 +109,7 @@ class Forecast:
             "frames": sum(cost.frames for cost in known) if whole else None,
             "wall_s": sum(cost.wall_s for cost in known) if whole else None,
             "disk_mb": sum(cost.disk_mb for cost in known) if whole else None,
-            "disk_free_mb": _free_mb(self.folder),
+            "disk_free_mb": _free_mb(self.folder or Path()),
             "memory_mb": max((c.memory_mb for c in known), default=None),
             "refused": {" ".join(p): lines for p, lines in self.refused.items()},
             "doubts": {" ".join(p): lines for p, lines in self.doubts.items()},
@@ -153,11 +156,6 @@ def _words(kind: tuple[Any, ...]) -> str:
 
 
 def _free_mb(folder: Path) -> float:
-    """Return what is free where a folder is, or will be."""
+    folder = folder.resolve()
     there = next(path for path in (folder, *folder.parents) if path.exists())
     return shutil.disk_usage(there).free / 1e6
-
-
-def _kind(cell: Cell) -> tuple[Any, ...]:
-    """Return what cells have in common that differ in their seed alone."""
-    return cell.route, cell.objects, cell.method, cell.budget

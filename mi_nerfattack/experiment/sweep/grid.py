@@ -19,16 +19,16 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.sweep.cell import Cell
 from mi_nerfattack.experiment.sweep.places import DrawSection, Places
 from mi_nerfattack.io import files
-from mi_nerfattack.io.strict_toml import parse_toml
+from mi_nerfattack.io.strict import parse_toml
 from mi_nerfattack.ranges import Count, NonNegative, Seed
-from mi_nerfattack.scenario.lines import tell
 from mi_nerfattack.scenario.named_file import File, NamedFile
 from mi_nerfattack.scenario.scenario import Scenario, load_scenario, portable_text
-from mi_nerfattack.scenario.section import Location, Section, problems, refuse
+from mi_nerfattack.scenario.section import Location, Section, problems, refuse, tell
+from mi_nerfattack.scenario.upgrade import new_lines
 from mi_nerfattack.scenario.world import judged_frames
 
 MOST_CELLS = 10_000
-_LENGTHS = ("max_iterations", "frames")  # of [attack], by method
+_LENGTHS = ("max_iterations", "frames")  # of [attack.method], by kind
 
 Label = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]{0,39}$")]
 
@@ -111,9 +111,9 @@ class Grid(Section):
         if self.budgets:
             for index, choice in enumerate(self.methods):
                 for key in _LENGTHS:
-                    if _depth(choice.set, ("attack", key)) == 2:
+                    if _depth(choice.set, ("attack", "method", key)) == 3:
                         refuse(
-                            f"methods.{index}.set.attack.{key}",
+                            f"methods.{index}.set.attack.method.{key}",
                             "stands beside budgets, which say it; give one of them",
                         )
         return self
@@ -154,7 +154,7 @@ class GridReader:
                 no place.
         """
         grid = self.grid
-        methods = grid.methods or (MethodChoice(name=self.base.attack.method.method),)
+        methods = grid.methods or (MethodChoice(name=self.base.attack.method.kind),)
         budgets = grid.budgets or (None,)
         for i, j in self._places_of():
             route, these = self._routes[i], self._objects[j]
@@ -198,7 +198,6 @@ class GridReader:
         }
 
     def _draw(self, route: int, objects: int, seed: int) -> list[dict[str, Any]]:
-        """Draw the objects of a choice beside a route."""
         section, layers = self._objects[objects].draw, self._layers(route, objects)
         assert section is not None
         values = functools.reduce(_merged, layers.values(), self.values)
@@ -221,15 +220,14 @@ class GridReader:
         values = self.values
         for layer in (*layers.values(), {"seed": seed}):
             values = _merged(values, layer)
-        attack = values.get("attack")
-        if budget is not None and isinstance(attack, dict):
-            kept = {k: v for k, v in attack.items() if k not in _LENGTHS}
-            values = values | {"attack": kept}
+        match values:
+            case {"attack": {"method": {**method}} as attack} if budget is not None:
+                kept = {k: v for k, v in method.items() if k not in _LENGTHS}
+                values = values | {"attack": attack | {"method": kept}}
         scenario = self._read(values, layers)
         if budget is not None:
-            values = _merged(
-                values, {"attack": self._length(scenario, budget, multiple)}
-            )
+            length = self._length(scenario, budget, multiple)
+            values = _merged(values, {"attack": {"method": length}})
             scenario = self._read(values, layers)
         text = portable_text(scenario, tomlkit.dumps(values))
         return text, scenario.digests(self._content)
@@ -239,7 +237,8 @@ class GridReader:
         try:
             return Scenario.model_validate(values, context=context)
         except ValidationError as err:
-            raise InputError(self._told(list(problems(err)), layers)) from err
+            told = new_lines(self.path, self.text)
+            raise InputError(told or self._told(list(problems(err)), layers)) from err
 
     def _told(
         self, found: list[tuple[Location, str]], layers: Mapping[Location, Any]
@@ -269,14 +268,14 @@ class GridReader:
         if multiple is None:
             raise InputError(
                 f"{self.path}: backward_multiple: is missing; budgets of gradients "
-                "count a pass back as so many drives: --check without budgets "
+                "count a pass back as so many drives: check of a grid without budgets "
                 "measures it"
             )
         iterations = int(budget / ((1 + multiple) * frames))
         if not iterations:
             raise InputError(
                 f"{self.path}: budgets: {budget} frames; an iteration of "
-                f"{method.method} costs {(1 + multiple) * frames:g}"
+                f"{method.kind} costs {(1 + multiple) * frames:g}"
             )
         return {"max_iterations": iterations}
 

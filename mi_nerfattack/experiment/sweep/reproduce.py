@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
+from mi_nerfattack.drives.table import records
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.experiment.run_folder import CHECKPOINT, SCENARIO
+from mi_nerfattack.experiment.claim import CHECKPOINT, EFFORT, SCENARIO
 from mi_nerfattack.experiment.sweep.cell import Cell, changed, folder_of
-from mi_nerfattack.experiment.sweep.table import LABELS, RESULTS, Row, read_table
+from mi_nerfattack.experiment.sweep.table import (
+    LABELS,
+    RESULTS,
+    Row,
+    read_made,
+    read_table,
+)
 from mi_nerfattack.io import files
+from mi_nerfattack.scenario.upgrade import upgraded_text
 
 #: What is compared.
-FIGURES = ("cross_track_mean_m", "wheel_out_s", "departed", "steps", "frames")
-_DRIVE = ("cell", "environment", "case", "run")
+FIGURES = ["cross_track_mean_m", "wheel_out_s", "departed", "steps", "frames"]
+_DRIVE = ["cell", "environment", "case", "run"]
 
 
 @dataclass(frozen=True)
@@ -26,14 +34,16 @@ class Replay:
     """What is to be repeated.
 
     Attributes:
-        table: of the sweep, without scenarios.
+        table: of the sweep.
         indices: rows that were asked for.
         cells: that they are of, as they were done.
+        versions: of packages and variant, by cell of the table.
     """
 
-    table: list[Row]
+    table: pd.DataFrame
     indices: tuple[int, ...]
     cells: tuple[Cell, ...]
+    versions: Mapping[str, dict[str, str]]
 
 
 def read_replay(
@@ -42,7 +52,7 @@ def read_replay(
     """Find rows and the cells that made them.
 
     Args:
-        folder: with ``results.parquet``; nothing else of it is read.
+        folder: with ``results.csv`` and ``cells.json``; nothing else of it is read.
         names: rows: their index, from 0, or CELL:ENVIRONMENT:CASE:RUN.
         count: of rows that are drawn besides.
         seed: of that.
@@ -50,10 +60,10 @@ def read_replay(
     Raises:
         InputError: the table is missing or wrong; there is no such row, it tells of a
             failure, or what it was made of is of other content here.
-        SetupError: pyarrow is not installed.
     """
     path = folder / RESULTS
-    table = read_table(path)
+    whole_table = read_table(path)
+    table = records(whole_table)
     indices = [_find(path, table, name) for name in names]
     whole = [i for i, row in enumerate(table) if row["status"] == "complete"]
     if count > len(whole):
@@ -61,10 +71,10 @@ def read_replay(
     drawn = np.random.default_rng(seed).choice(len(whole), count, replace=False)
     indices = dict.fromkeys([*indices, *(whole[i] for i in sorted(drawn))])
     first = {table[i]["cell"]: table[i] for i in indices}
-    scenarios = read_table(path, ["cell", "scenario"], first)
-    texts = {row["cell"]: row["scenario"] for row in scenarios}
-    cells = tuple(_cell(row, texts[name]) for name, row in first.items())
-    return Replay(table, tuple(indices), cells)
+    made = read_made(folder)
+    cells = tuple(_cell(row, made[name]) for name, row in first.items())
+    versions = {name: about["versions"] for name, about in made.items()}
+    return Replay(whole_table, tuple(indices), cells, versions)
 
 
 def take_checkpoints(replay: Replay, folder: Path, output: Path) -> None:
@@ -79,8 +89,8 @@ def take_checkpoints(replay: Replay, folder: Path, output: Path) -> None:
         InputError: a cell's checkpoint is missing, or cannot be copied.
     """
     for cell in replay.cells:
-        there, own = folder_of(folder, cell) / CHECKPOINT, folder_of(output, cell)
-        here = own / CHECKPOINT
+        found, own = folder_of(folder, cell), folder_of(output, cell)
+        there, here = found / CHECKPOINT, own / CHECKPOINT
         if not there.exists():
             raise InputError(
                 f"{there}: there is none; without --drives-only, the attack is repeated"
@@ -88,17 +98,23 @@ def take_checkpoints(replay: Replay, folder: Path, output: Path) -> None:
         if not here.exists():
             files.make_folder(own)
             files.write_text(own / SCENARIO, cell.text)
-            files.write_bytes(here, files.read_bytes(there, files.MAX_TENSOR_BYTES))
+            for name in (EFFORT, CHECKPOINT):  # the last tells that all are there
+                raw = files.read_bytes(found / name, files.MAX_TENSOR_BYTES)
+                files.write_bytes(own / name, raw)
 
 
 def compare_rows(
-    replay: Replay, repeated: Iterable[Row], errors: Mapping[str, str]
+    replay: Replay,
+    repeated: pd.DataFrame,
+    made: Mapping[str, Any],
+    errors: Mapping[str, str],
 ) -> dict[str, Any]:
     """Say by how much repeated rows differ from the table's.
 
     Args:
         replay: what was to be repeated.
         repeated: table of the repetition.
+        made: what its cells were made of.
         errors: of cells that failed, by cell.
 
     Returns:
@@ -109,29 +125,35 @@ def compare_rows(
         ``versions`` differ (there, here), and its ``error``; ``largest_difference`` of
         the rows that were asked for, null where none is there.
     """
-    found = {_key(row): row for row in repeated if row["status"] == "complete"}
-    told = []
-    for index in replay.indices:
-        row, again = replay.table[index], found.get(_key(replay.table[index]))
-        sides = {"stored": _figures(row), "repeated": again and _figures(again)}
-        difference = again and _difference(row, again)
-        about = {"row": index} | {name: row[name] for name in _DRIVE}
-        told.append(about | sides | {"difference": difference})
+    stored, again = (
+        table[table["status"] == "complete"].set_index(_DRIVE)[FIGURES]
+        for table in (replay.table, repeated)
+    )
+    difference = (stored.astype(float) - again.astype(float)).abs()
+    told, asked = [], replay.table.iloc[list(replay.indices)]
+    for index, labels in zip(replay.indices, records(asked[_DRIVE]), strict=True):
+        row, key = {"row": index} | labels, tuple(labels.values())
+        sides = {"stored": stored, "repeated": again, "difference": difference.dropna()}
+        for name, side in sides.items():
+            row[name] = records(side.loc[[key]])[0] if key in side.index else None
+        told.append(row)
     cells = []
     for cell in replay.cells:
-        stored = {_key(row): row for row in replay.table if row["cell"] == cell.id}
-        own = {key for key in found if key[0] == cell.id}
-        both = sorted(stored.keys() & own)
-        pairs = [(stored[key], found[key]) for key in both]
-        each = {
-            "cell": cell.id,
-            "rows": len(pairs),
-            "unmatched": len(stored.keys() ^ own),
-        }
-        each["largest_difference"] = _largest(_difference(*pair) for pair in pairs)
-        each["versions"] = _versions(*pairs[0]) if pairs else {}
-        cells.append(each | {"error": errors.get(cell.id)})
-    largest = _largest(row["difference"] for row in told if row["difference"])
+        own = difference[difference.index.get_level_values("cell") == cell.id]
+        there, here = replay.versions[cell.id], made.get(cell.id, {}).get("versions")
+        both = own.dropna()
+        cells.append(
+            {
+                "cell": cell.id,
+                "rows": len(both),
+                "unmatched": len(own) - len(both),
+                "largest_difference": _largest(both),
+                "versions": _versions(there, here) if len(both) and here else {},
+                "error": errors.get(cell.id),
+            }
+        )
+    known = [row["difference"] for row in told if row["difference"]]
+    largest = _largest(pd.DataFrame(known))
     return {"rows": told, "cells": cells, "largest_difference": largest}
 
 
@@ -178,7 +200,6 @@ def _told(row: Mapping[str, Any]) -> str:
 
 
 def _find(path: Path, table: Sequence[Row], name: str) -> int:
-    """Return the index of a row."""
     if name.isdecimal():
         index = int(name)
         if index >= len(table):
@@ -200,38 +221,32 @@ def _find(path: Path, table: Sequence[Row], name: str) -> int:
     return index
 
 
-def _cell(row: Row, text: str) -> Cell:
+def _cell(row: Row, made: Mapping[str, Any]) -> Cell:
     """Return the cell of a row, as it was done; findings of its checks are told."""
     name, labels = row["cell"], {key: row[key] for key in LABELS[1:]}
-    cell = Cell(**labels, text=text, digests=json.loads(row["digests"]), anyway=True)
+    digests, text = dict(made["digests"]), made["scenario"]
+    today = upgraded_text(name, text)
+    cell = Cell(**labels, text=today, digests=digests, anyway=True, name=name)
+    if today != text:  # of the first form, whose digest is made of other keys
+        digests["scenario"] = cell.scenario.digest()
     if wrong := changed(cell):
-        made = json.loads(row["versions"])["mi_nerfattack"]
         raise InputError(
             f"{name}: {', '.join(wrong)}: other content here than where the row was "
-            f"made, by version {made}; only the same can be repeated"
+            f"made, by version {made['versions']['mi_nerfattack']}; only the same can "
+            "be repeated"
         )
     return cell
 
 
-def _key(row: Row) -> tuple[Any, ...]:
-    return tuple(row[name] for name in _DRIVE)
+def _largest(differences: pd.DataFrame) -> dict[str, float] | None:
+    if differences.empty:
+        return None
+    return {name: float(differences[name].max()) for name in FIGURES}
 
 
-def _figures(row: Row) -> dict[str, Any]:
-    return {name: row[name] for name in FIGURES}
-
-
-def _difference(one: Row, other: Row) -> dict[str, float]:
-    return {name: abs(float(one[name]) - float(other[name])) for name in FIGURES}
-
-
-def _largest(differences: Iterable[dict[str, float]]) -> dict[str, float] | None:
-    rows = list(differences)
-    return {name: max(row[name] for row in rows) for name in FIGURES} if rows else None
-
-
-def _versions(one: Row, other: Row) -> dict[str, list[Any]]:
-    there, here = json.loads(one["versions"]), json.loads(other["versions"])
+def _versions(
+    there: Mapping[str, str], here: Mapping[str, str]
+) -> dict[str, list[Any]]:
     names = sorted(there.keys() | here.keys())
     pairs = {name: [there.get(name), here.get(name)] for name in names}
     return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}

@@ -6,29 +6,29 @@ looks tell nothing about other attacks.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict
-from itertools import chain, product
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
+import pandas as pd
 
+from mi_nerfattack.drives.table import records, with_starts
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.evaluation.flags import black_box_better, noise_larger
-from mi_nerfattack.evaluation.intervals import share_interval
-from mi_nerfattack.evaluation.pairs import (
-    DEPARTED_S,
-    Effect,
-    Outcome,
-    compare,
-    compare_departures,
-    over_attacks,
-)
+from mi_nerfattack.evaluation.pairs import Effect, compare, compare_departures
+from mi_nerfattack.evaluation.summary import DEPARTED_S, summary
+from mi_nerfattack.evaluation.verdict import black_box_better, noise_larger
 from mi_nerfattack.experiment.run_folder import METRICS
 from mi_nerfattack.experiment.sweep.cell import CELLS
-from mi_nerfattack.experiment.sweep.table import LABELS, RESULTS, Row, read_table
+from mi_nerfattack.experiment.sweep.table import (
+    LABELS,
+    RESULTS,
+    Row,
+    read_made,
+    read_table,
+)
 from mi_nerfattack.io import files
 from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, NO_OBJECT, RANDOM
 
@@ -42,22 +42,14 @@ _ERROR = "cross_track_mean_m"
 _SEED = 0  # of the resampling
 
 
-class Group(NamedTuple):
-    """What drives have in common that are summarised together.
-
-    Attributes:
-        route: None of all routes together.
-        method: name of the choice.
-        budget: frames; None where the grid has none.
-        environment: name.
-        case: what objects showed.
-    """
-
-    route: str | None
-    method: str
-    budget: int | None
-    environment: str
-    case: str
+#: What drives have in common that are summarised together; no route: all routes.
+_GROUP = ["route", "method", "budget", "environment", "case"]
+_OF_GROUP = (
+    *(*_GROUP, "places", "seeds", "frames", "attacks", "cross_track_mean_m"),
+    *("cross_track_sd_m", "cross_track_mean_ci95_m", "wheel_out_s", "attacks_out"),
+    *("attacks_out_rate_ci95", "cross_track_total", "drives", "drives_departed"),
+    "departure_rate_ci95",
+)
 
 
 def write_summary(
@@ -74,10 +66,9 @@ def write_summary(
 
     Raises:
         InputError: the table is missing or wrong, or a file cannot be read or written.
-        SetupError: pyarrow is not installed.
     """
-    rows = read_table(folder / RESULTS)
-    document = summarise(rows, read_attacks(folder, rows, known))
+    table = read_table(folder / RESULTS)
+    document = summarise(table, read_attacks(folder, table, known))
     files.write_json(folder / SUMMARY, document)
     return document
 
@@ -102,14 +93,14 @@ def told_attacks(folder: Path) -> dict[str, dict[str, Any]]:
 
 def read_attacks(
     folder: Path,
-    rows: Iterable[Row],
+    table: pd.DataFrame,
     known: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> list[dict[str, Any]]:
     """Return what is told of each attack: by its cell's folder, or a summary.
 
     Args:
         folder: of the sweep.
-        rows: of its table.
+        table: of the sweep.
         known: attacks by cell, of :func:`told_attacks` elsewhere; those of cells
             without a folder count, and before them those of the sweep's own summary.
 
@@ -121,7 +112,8 @@ def read_attacks(
     Raises:
         InputError: a file is damaged.
     """
-    cells = {row["cell"]: row for row in rows if row["status"] == "complete"}
+    complete = table[table["status"] == "complete"]
+    cells = {row["cell"]: row for row in records(complete.drop_duplicates("cell"))}
     earlier = {**known, **told_attacks(folder)}
     found = []
     for cell, row in cells.items():
@@ -130,7 +122,7 @@ def read_attacks(
             document = files.read_json(path)
             attack = {name: row[name] for name in LABELS}
             section = document["scenario"]["attack"]
-            attack |= {"section": section, "attack_method": section["method"]}
+            attack |= {"section": section, "attack_method": section["method"]["kind"]}
             attack |= {key: document[key] for key in ("converged", "flags")}
             found.append(attack | {"curve": document.get("curve")})
         elif cell in earlier:
@@ -139,26 +131,28 @@ def read_attacks(
 
 
 def summarise(
-    rows: Sequence[Row], attacks: Sequence[Mapping[str, Any]] = ()
+    table: pd.DataFrame, attacks: Sequence[Mapping[str, Any]] = ()
 ) -> dict[str, Any]:
     """Return what ``summary.json`` holds; docs/sweep.md says what it means.
 
     Args:
-        rows: of the table.
+        table: of the sweep.
         attacks: as of :func:`read_attacks`.
     """
-    failed = [row for row in rows if row["status"] != "complete"]
-    groups = _grouped(_with_starts(row for row in rows if row["status"] == "complete"))
-    compared = _comparisons(groups)
-    cells = {row["cell"] for row in rows}
+    is_complete = table["status"] == "complete"
+    failed, drives = table[~is_complete], with_starts(table[is_complete], "cell")
+    drives["scenario"] = drives["route"] + ", " + drives["objects"]
+    everywhere = drives.copy()
+    everywhere["route"] = None
+    compared = [*_comparisons(drives), *_comparisons(everywhere)]
     return {
         "schema": SCHEMA,
         "flags": [*_black_box(attacks), *_noise(compared), *_own_flags(attacks)],
-        "cells": len(cells),
-        "complete": len(cells) - len(failed),
-        "failed": [{k: row[k] for k in (*LABELS, "error")} for row in failed],
+        "cells": table["cell"].nunique(),
+        "complete": drives["cell"].nunique(),
+        "failed": records(failed[[*LABELS, "error"]]),
         "departed_s": DEPARTED_S,
-        "groups": [_about(group, own) for group, own in groups.items()],
+        "groups": [*_groups(drives), *_groups(everywhere)],
         "comparisons": compared,
         "attacks": [
             {key: value for key, value in attack.items() if key != "section"}
@@ -167,90 +161,45 @@ def summarise(
     }
 
 
-def _grouped(rows: Sequence[Row]) -> dict[Group, list[Row]]:
-    """Return the drives of each route, then those of all, in the table's order."""
-    found: dict[Group, list[Row]] = {}
-    for together, row in product((False, True), rows):
-        route = None if together else row["route"]
-        rest = (row[name] for name in ("method", "budget", "environment", "case"))
-        found.setdefault(Group(route, *rest), []).append(row)
-    return found
+def _groups(drives: pd.DataFrame) -> list[dict[str, Any]]:
+    """Summarise groups over their attacks, each of which is a cell."""
+    found = summary(drives, _GROUP, ["cell"], _SEED)
+    if found.empty:
+        return []
+    groups = drives.groupby(_GROUP, sort=False, dropna=False)
+    numbers = groups.agg(places=("scenario", "nunique"), seeds=("seed", "nunique"))
+    found[["places", "seeds"]] = numbers.to_numpy()
+    return records(found[list(_OF_GROUP)])
 
 
-def _about(group: Group, rows: Sequence[Row]) -> dict[str, Any]:
-    """Summarise one group over its attacks."""
-    by_cell: dict[str, list[Row]] = {}
-    for row in rows:
-        by_cell.setdefault(row["cell"], []).append(row)
-    attacks = list(by_cell.values())
-
-    def over(figure: Callable[[Row], float]) -> np.ndarray:
-        return np.array([np.mean([figure(row) for row in own]) for own in attacks])
-
-    left = sum(row["departed"] for row in rows)
-    errors, out_s = over(lambda row: row[_ERROR]), over(lambda row: row["wheel_out_s"])
-    return {
-        **group._asdict(),
-        "places": len({(row["route"], row["objects"]) for row in rows}),
-        "seeds": len({row["seed"] for row in rows}),
-        "frames": float(over(lambda row: row["frames"]).mean()),
-        **over_attacks(errors, out_s, _SEED),
-        "cross_track_total": float(over(lambda r: r[_ERROR] * r["steps"]).mean()),
-        "drives": len(rows),
-        "drives_departed": left,
-        "departure_rate_ci95": share_interval(left, len(rows)),
-    }
-
-
-def _comparisons(groups: Mapping[Group, Sequence[Row]]) -> list[dict[str, Any]]:
+def _comparisons(drives: pd.DataFrame) -> list[dict[str, Any]]:
     """Compare attacks with other cases of theirs, and methods with the gradient."""
-    sides = {group: _outcomes(rows) for group, rows in groups.items()}
     found = []
-    for group in groups:
-        if group.case != ATTACK:
-            continue
-        others = [group._replace(case=c) for c in (RANDOM, BEST_RANDOM, NO_OBJECT)]
-        if group.method != GRADIENT:
-            others.append(group._replace(method=GRADIENT))
+    attacked = drives[drives["case"] == ATTACK]
+    for _, one in attacked.groupby(_GROUP, sort=False, dropna=False):
+        [labels] = records(one[_GROUP].head(1))
+        others = [labels | {"case": case} for case in (RANDOM, BEST_RANDOM, NO_OBJECT)]
+        if labels["method"] != GRADIENT:
+            others.append(labels | {"method": GRADIENT})
         for other in others:
-            one, second = sides[group], sides.get(other, [])
+            second = _where(drives, other)
             if _attacks(one) & _attacks(second):
-                about = {"other_method": other.method, "other_case": other.case}
+                about = {"other_method": other["method"], "other_case": other["case"]}
                 effect = asdict(compare(one, second, _ERROR, _SEED))
                 left = asdict(compare_departures(one, second))
-                about |= {"effect": effect, "departures": left}
-                found.append(group._asdict() | about)
+                found.append(labels | about | {"effect": effect, "departures": left})
     return found
 
 
-def _outcomes(rows: Sequence[Row]) -> list[Outcome]:
-    """Return drives as they are paired: by route, objects, seed and start."""
-    return [
-        Outcome(
-            scenario=f"{row['route']}, {row['objects']}",
-            seed=row["seed"],
-            environment=row["environment"],
-            case=row["case"],
-            run=row["run"],
-            start=row["start"],
-            figures=row,
-        )
-        for row in rows
-    ]
+def _attacks(drives: pd.DataFrame) -> set[tuple[str, int]]:
+    return set(zip(drives["scenario"], drives["seed"], strict=True))
 
 
-def _attacks(side: Iterable[Outcome]) -> set[tuple[str, int]]:
-    return {(drive.scenario, drive.seed) for drive in side}
-
-
-def _with_starts(rows: Iterable[Row]) -> list[Row]:
-    """Say which start each drive is from: looks go through those of other cases."""
-    rows, starts = list(rows), {}
-    for row in rows:
-        if row["case"] != RANDOM:
-            cell = row["cell"]
-            starts[cell] = max(starts.get(cell, 1), row["run"] + 1)
-    return [row | {"start": row["run"] % starts.get(row["cell"], 1)} for row in rows]
+def _where(drives: pd.DataFrame, labels: Mapping[str, Any]) -> pd.DataFrame:
+    for name, value in labels.items():
+        own = drives[name].isna() if value is None else drives[name] == value
+        drives = drives[own]
+    return drives
 
 
 def _black_box(attacks: Iterable[Mapping[str, Any]]) -> Iterator[str]:
@@ -301,3 +250,39 @@ def _own_flags(attacks: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     for name, raised in told.items():
         cell, rest = raised[0]
         yield f"{name}: in {len(raised)} of {len(attacks)} attacks; in {cell}: {rest}"
+
+
+@dataclass(frozen=True)
+class Taken:
+    """What stands for cells that are not done again.
+
+    Attributes:
+        rows: of the table, of each complete cell.
+        made: what these cells were made of.
+        attacks: of the summary, by cell.
+    """
+
+    rows: Mapping[str, Sequence[Row]] = field(default_factory=dict)
+    made: Mapping[str, Any] = field(default_factory=dict)
+    attacks: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+
+def read_taken(folders: Iterable[Path]) -> Taken:
+    """Read the complete cells of other sweeps.
+
+    Args:
+        folders: with ``results.csv``, ``cells.json`` and, for curves and flags,
+            ``summary.json``; of a cell that several have, the first one's counts.
+
+    Raises:
+        InputError: a table is missing, or a file is damaged.
+    """
+    taken = Taken({}, {}, {})
+    for folder in folders:
+        table = read_table(folder / RESULTS)
+        groups = table[table["status"] == "complete"].groupby("cell", sort=False)
+        own = {str(cell): records(drives) for cell, drives in groups}
+        made = {cell: about for cell, about in read_made(folder).items() if cell in own}
+        attacks = told_attacks(folder) | dict(taken.attacks)
+        taken = Taken(own | dict(taken.rows), made | dict(taken.made), attacks)
+    return taken

@@ -4,33 +4,44 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import drjit as dr
+import pandas as pd
 
 from mi_nerfattack import variant
 from mi_nerfattack.errors import InputError, RefusedError
+from mi_nerfattack.experiment.job import quiet
 from mi_nerfattack.experiment.sweep.cell import (
     CELLS,
+    PROVENANCE,
     Cell,
     folder_of,
     is_complete,
     run_cell,
 )
+from mi_nerfattack.experiment.sweep.grid import load_cells
+from mi_nerfattack.experiment.sweep.summary import SUMMARY, Taken, write_summary
 from mi_nerfattack.experiment.sweep.table import (
     RESULTS,
     Row,
     complete_rows,
     failed_row,
     labels_of,
-    require_parquet,
+    made_of,
+    read_table,
     write_table,
 )
-from mi_nerfattack.experiment.sweep.taken import Taken
 from mi_nerfattack.io import files, locks
-from mi_nerfattack.system.workers import AbstractWork, AbstractWorkers, OnUnits
+from mi_nerfattack.system.workers import (
+    AbstractWork,
+    AbstractWorkers,
+    InThisProcess,
+    OnUnits,
+    Processes,
+)
 
 #: How often a cell is tried in one run of a sweep.
 ATTEMPTS = 3
@@ -94,6 +105,7 @@ class Sweep:
     kept: int = 0
     errors: dict[int, str] = field(default_factory=dict)
     _rows: dict[int, list[Row]] = field(default_factory=dict)
+    _made: dict[int, dict[str, Any]] = field(default_factory=dict)
     _refused: set[int] = field(default_factory=set)
 
     @property
@@ -114,19 +126,20 @@ class Sweep:
         Raises:
             InputError: another process works on the sweep, or a file cannot be read or
                 written.
-            SetupError: pyarrow is not installed.
         """
-        require_parquet()
         work = self.work
-        for name in (CELLS, FAILED):
-            files.make_folder(work.folder / name)
-        with locks.exclusive(work.folder):
+        with locks.exclusive(files.make_folder(work.folder)):
+            for path in filter(locks.is_partial, work.folder.iterdir()):
+                path.unlink()  # below, jobs of a killed sweep may still write
+            for name in (CELLS, FAILED):
+                files.make_folder(work.folder / name)
             for index, cell in enumerate(work.cells):
                 if is_complete(work.folder, cell):
                     self._take(index)
                 elif rows := self.taken.rows.get(cell.id):
                     self.complete.add(index)
                     self._rows[index] = [row | labels_of(cell) for row in rows]
+                    self._made[index] = self.taken.made[cell.id]
                 elif (path := self._failure(index)).exists():
                     self._fail(index, files.read_text(path))
             self.kept = len(self.complete)
@@ -161,16 +174,75 @@ class Sweep:
     def _take(self, index: int) -> None:
         self.errors.pop(index, None)
         self.complete.add(index)
-        self._rows[index] = complete_rows(self.work.cells[index], self.work.folder)
+        cell, folder = self.work.cells[index], self.work.folder
+        self._rows[index] = complete_rows(cell, folder)
+        about = files.read_json(folder_of(folder, cell) / PROVENANCE)
+        self._made[index] = made_of(cell, about["versions"])
 
     def _fail(self, index: int, error: str) -> None:
-        self.errors[index] = error
-        self._rows[index] = [failed_row(self.work.cells[index], error)]
+        self.errors[index], cell = error, self.work.cells[index]
+        self._rows[index], self._made[index] = [failed_row(cell, error)], made_of(cell)
 
     def _failure(self, index: int) -> Path:
         return self.work.folder / FAILED / f"{self.work.cells[index].id}.txt"
 
     def _write(self) -> None:
-        rows = [row for index in sorted(self._rows) for row in self._rows[index]]
-        write_table(self.table, rows)
+        order = sorted(self._rows)
+        rows = [row for index in order for row in self._rows[index]]
+        made = {self.work.cells[index].id: self._made[index] for index in order}
+        write_table(self.work.folder, rows, made)
         self.on_change(self)
+
+
+@dataclass(frozen=True)
+class FinishedSweep:
+    """What a sweep has written.
+
+    Args:
+        folder: of the sweep, or a folder with a copy of its tables.
+    """
+
+    folder: Path
+
+    @cached_property
+    def drives(self) -> pd.DataFrame:
+        """A table with one row per drive; a cell that failed has one row."""
+        return read_table(self.folder / RESULTS)
+
+    @cached_property
+    def summary(self) -> dict[str, Any]:
+        """The content of ``summary.json``."""
+        return files.read_json(self.folder / SUMMARY)
+
+
+def sweep(
+    grid: str | Path,
+    folder: str | Path,
+    *,
+    workers: int = 1,
+    progress: Callable[[str, int, int, str], None] = quiet,
+) -> FinishedSweep:
+    """Attack in every cell of a grid: ``mi-nerfattack sweep``.
+
+    Args:
+        grid: TOML file.
+        folder: of the sweep: new, or of the same grid, which then goes on.
+        workers: cells that are done at a time; see `evaluate_policy`.
+        progress: called with stage, cells done, cells in all and a remark, for example
+            `mi_nerfattack.progress()`.
+
+    Raises:
+        InputError: the grid or a file is wrong, or another process works in the folder.
+    """
+    variant.ensure()
+    cells = tuple(load_cells(Path(grid)))
+
+    def show(state: Sweep) -> None:
+        remark = f"{state.steps} control periods, {len(state.errors)} failed"
+        progress("cells", len(state.complete), len(cells), remark)
+
+    work = Cells(cells, files.make_folder(Path(folder)).resolve())
+    crew = Processes(workers, pieces_each=1) if workers > 1 else InThisProcess()
+    Sweep(work, show).run(crew)
+    write_summary(work.folder)
+    return FinishedSweep(work.folder)

@@ -1,54 +1,55 @@
-"""The table of a sweep: one Parquet file, a row a drive, made of the cells' folders."""
+"""The table of a sweep, with one row per drive, made of the folders of its cells."""
 
 from __future__ import annotations
 
-import io
-import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
+from mi_nerfattack.drives.table import (
+    NUMBER,
+    TEXT,
+    TRUTH,
+    WHOLE,
+    read_csv,
+    write_csv,
+)
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.evaluation.metrics import cells
 from mi_nerfattack.experiment.run_folder import METRICS
-from mi_nerfattack.experiment.sweep.cell import PROVENANCE, Cell, folder_of
+from mi_nerfattack.experiment.sweep.cell import Cell, folder_of
 from mi_nerfattack.io import files
 from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, RANDOM
-from mi_nerfattack.system.extras import load_extra
 
-FORMAT = "mi_nerfattack sweep 1"
-RESULTS = "results.parquet"
-MAX_TABLE_BYTES = 1 << 30
-MAX_ROWS = 1 << 24
-#: Columns and their Arrow types; docs/sweep.md says what they mean.
-SCHEMA = {
-    "cell": "string",
-    "route": "string",
-    "objects": "string",
-    "method": "string",
-    "budget": "int64",
-    "seed": "int64",
-    "environment": "string",
-    "case": "string",
-    "run": "int64",
-    "frames": "int64",
-    "steps": "int64",
-    "cross_track_mean_m": "float64",
-    "wheel_out_s": "float64",
-    "departed": "bool_",
-    "status": "string",
-    "error": "string",
-    "digests": "string",
-    "versions": "string",
-    "scenario": "category",
+#: The table, and what its cells were made of.
+RESULTS, MADE_OF = "results.csv", "cells.json"
+#: Columns and their pandas types; docs/sweep.md says what they mean.
+COLUMNS = {
+    "cell": TEXT,
+    "route": TEXT,
+    "objects": TEXT,
+    "method": TEXT,
+    "budget": WHOLE,
+    "seed": WHOLE,
+    "environment": TEXT,
+    "case": TEXT,
+    "run": WHOLE,
+    "frames": WHOLE,
+    "steps": WHOLE,
+    "cross_track_mean_m": NUMBER,
+    "wheel_out_s": NUMBER,
+    "departed": TRUTH,
+    "status": TEXT,
+    "error": TEXT,
 }
 #: Columns that tell cells apart.
 LABELS = ("cell", "route", "objects", "method", "budget", "seed")
+#: Columns that each drive has.
+_OF_DRIVE = [name for name in COLUMNS if name not in (*LABELS, "error")]
+_COPIED = ("run", "steps", "cross_track_mean_m", "wheel_out_s")
 Row = dict[str, Any]
-
-
-def require_parquet() -> None:
-    """Raise SetupError where tables cannot be written."""
-    load_extra("pyarrow", "sweep", "a sweep's table")
 
 
 def complete_rows(cell: Cell, sweep: Path) -> list[Row]:
@@ -61,130 +62,85 @@ def complete_rows(cell: Cell, sweep: Path) -> list[Row]:
     Raises:
         InputError: a file of the cell's folder is missing or damaged.
     """
-    folder = folder_of(sweep, cell)
-    document = files.read_json(folder / METRICS)
-    about = files.read_json(folder / PROVENANCE)
+    document = files.read_json(folder_of(sweep, cell) / METRICS)
     frames = _frames(document)
-    labels = labels_of(cell) | {"versions": json.dumps(about["versions"])}
     return [
         {
-            **labels,
-            "environment": environment,
-            "case": case,
-            "run": drive["run"],
-            "frames": frames.get(case, 0),
-            "steps": drive["steps"],
-            "cross_track_mean_m": drive["cross_track_mean_m"],
-            "wheel_out_s": drive["wheel_out_s"],
+            **labels_of(cell),
+            **{name: case[name] for name in ("environment", "case")},
+            "frames": frames.get(case["case"], 0),
+            **{name: drive[name] for name in _COPIED},
             "departed": drive["steps_departed"] > 0,
             "status": "complete",
         }
-        for cases in document["routes"].values()
-        for environment, figures in cases.items()
-        for case, found in figures.items()
-        for drive in found["per_run"]
+        for case in cells(document["routes"], "route", "environment", "case")
+        for drive in case["per_run"]
     ]
 
 
 def failed_row(cell: Cell, error: str) -> Row:
     """Return the one row of a cell that failed."""
-    return {**labels_of(cell), "status": "failed", "error": error}
+    lines = "\n".join(error.splitlines())  # a lone \\r would end a row of the file
+    return {**labels_of(cell), "status": "failed", "error": lines}
 
 
-def write_table(path: Path, rows: Iterable[Row]) -> None:
-    """Write the table, whole or not at all.
+def made_of(cell: Cell, versions: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """Return what a cell is made of: digests of its files, versions, scenario.
 
     Args:
-        path: of the file.
-        rows: values that are missing are null.
-
-    Raises:
-        InputError: it cannot be written; the file that was there is intact.
-        SetupError: pyarrow is not installed.
+        cell: of the sweep.
+        versions: of packages and variant; None of a cell that failed.
     """
-    pa = load_extra("pyarrow", "sweep", "a sweep's table")
-    parquet = load_extra("pyarrow.parquet", "sweep", "a sweep's table")
-    buffer = io.BytesIO()
-    table = pa.Table.from_pylist(list(rows), schema=_schema(pa))
-    parquet.write_table(table, buffer)
-    files.write_bytes(path, buffer.getvalue())
+    return {"digests": cell.digests, "versions": versions, "scenario": cell.text}
 
 
-def read_table(
-    path: Path, columns: Sequence[str] | None = None, cells: Iterable[str] | None = None
-) -> list[Row]:
-    """Read a table, row by row.
+def make_table(rows: Iterable[Row]) -> pd.DataFrame:
+    """Return rows as a table; values that are missing are NA."""
+    return pd.DataFrame(list(rows), columns=list(COLUMNS)).astype(COLUMNS)
 
-    Args:
-        path: of the file.
-        columns: names; by default all but the scenarios, which are long.
-        cells: whose rows are wanted; by default all.
+
+def write_table(folder: Path, rows: Iterable[Row], cells: Mapping[str, Any]) -> None:
+    """Write the table of a sweep, and `made_of` of its cells, each file at once."""
+    files.write_json(folder / MADE_OF, cells)
+    write_csv(folder / RESULTS, make_table(rows))
+
+
+def read_table(path: Path) -> pd.DataFrame:
+    """Read a table, with `cross_track_total`: mean error times steps.
 
     Raises:
         InputError: there is none, or it is damaged, too large, or not a sweep's table.
-        SetupError: pyarrow is not installed.
     """
-    pa = load_extra("pyarrow", "sweep", "a sweep's table")
-    load_extra("pyarrow.compute", "sweep", "a sweep's table")
-    parquet = load_extra("pyarrow.parquet", "sweep", "a sweep's table")
-    raw = files.read_bytes(path, MAX_TABLE_BYTES)
-    try:
-        with parquet.ParquetFile(io.BytesIO(raw)) as file:
-            _check(path, file.schema_arrow, file.metadata.num_rows, _schema(pa))
-            names = [name for name in SCHEMA if name != "scenario"]
-            table = file.read(columns=columns or names)
-            if cells is not None:
-                wanted = pa.compute.field("cell").isin(list(cells))
-                table = table.filter(wanted)
-            return table.to_pylist()
-    except (pa.ArrowException, OSError, ValueError) as err:
-        if isinstance(err, InputError):
-            raise
+    table = read_csv(path, COLUMNS)
+    drives = table[table["status"] == "complete"]
+    told = table["status"].isin(["complete", "failed"])
+    if not told.all() or drives[_OF_DRIVE].isna().any(axis=None):
         raise InputError(
-            f"{path}: no Parquet file, or a damaged one ({err}); give the sweep's "
-            "command again, which makes it anew"
-        ) from err
-
-
-def _schema(pa: Any) -> Any:
-    """Return the table's Arrow schema; equal scenarios are kept once."""
-    category = pa.dictionary(pa.int32(), pa.string())
-    types = [
-        (name, category if kind == "category" else getattr(pa, kind)())
-        for name, kind in SCHEMA.items()
-    ]
-    return pa.schema(types, metadata={"format": FORMAT})
-
-
-def _check(path: Path, found: Any, rows: int, wanted: Any) -> None:
-    """Refuse other tables, and larger ones than are read."""
-    told = (found.metadata or {}).get(b"format", b"").decode(errors="replace")
-    if told != FORMAT:
-        raise InputError(
-            f"{path}: not a sweep's table (format {told!r}, not {FORMAT!r})"
+            f"{path}: damaged: a drive has no figures; give the sweep's command again, "
+            "which makes the table again"
         )
-    here, there = (set(zip(s.names, s.types, strict=True)) for s in (found, wanted))
-    if wrong := sorted({name for name, _ in here ^ there}):
-        raise InputError(
-            f"{path}: columns {', '.join(wrong)} are missing or others than ours; "
-            "give the sweep's command again, which makes the table anew"
-        )
-    if rows > MAX_ROWS:
-        raise InputError(f"{path}: {rows} rows; at most {MAX_ROWS} are read")
+    return with_total(table)
+
+
+def with_total(table: pd.DataFrame) -> pd.DataFrame:
+    """Add `cross_track_total`, metre-steps."""
+    steps = table["steps"].astype(NUMBER)
+    return table.assign(cross_track_total=table["cross_track_mean_m"] * steps)
+
+
+def read_made(folder: Path) -> dict[str, Any]:
+    """Read what the cells of a sweep were made of, see :func:`made_of`.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    return files.read_json(folder / MADE_OF)
 
 
 def labels_of(cell: Cell) -> Row:
     """Return what all rows of a cell have in common."""
-    return {
-        "cell": cell.id,
-        "route": cell.route,
-        "objects": cell.objects,
-        "method": cell.method,
-        "budget": cell.budget,
-        "seed": cell.seed,
-        "digests": json.dumps(cell.digests),
-        "scenario": cell.text,
-    }
+    names = ("route", "objects", "method", "budget", "seed")
+    return {"cell": cell.id} | {name: getattr(cell, name) for name in names}
 
 
 def _frames(document: Any) -> dict[str, int]:

@@ -15,7 +15,7 @@ from mi_nerfattack.deploy.surrogate.environment import SurrogateEnvironment
 from mi_nerfattack.deploy.surrogate.scene import showing
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Finite, NonNegative, Share, Whole, checked
-from mi_nerfattack.render.pathtrace.daylight import DAYLIGHT
+from mi_nerfattack.render.pathtrace.load import DAYLIGHT
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.scenario.deployment import SURROGATE, Deployment
 from mi_nerfattack.scenario.scenario import Scenario

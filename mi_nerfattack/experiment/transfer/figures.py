@@ -4,27 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from mi_nerfattack.evaluation.intervals import share_interval
+from mi_nerfattack.drives.run import Groups, OnSteps, run_drives
+from mi_nerfattack.drives.table import records
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.metrics import summarise
-from mi_nerfattack.evaluation.pairs import DEPARTED_S, over_attacks
+from mi_nerfattack.evaluation.summary import DEPARTED_S, share_interval, summary
+from mi_nerfattack.experiment.run_folder import SCENARIO
 from mi_nerfattack.experiment.transfer.found import FoundAttack
-from mi_nerfattack.experiment.transfer.work import Batch, TransferWork
+from mi_nerfattack.experiment.transfer.work import Batch, TransferDrives
+from mi_nerfattack.io import files, locks
+from mi_nerfattack.report.plots.transfer import plot_quality, plot_transfer
 from mi_nerfattack.rollout.drive import ATTACK, Drive
 from mi_nerfattack.scenario.deployment import SURROGATE
+from mi_nerfattack.system.workers import AbstractWorkers
 
 SCHEMA = 1
 
 #: Figures of a case by the digest of its batch.
 Figures = Mapping[str, dict[str, Any]]
 Row = dict[str, Any]
+_OF_CASE = (
+    *("attacks", "cross_track_mean_m", "cross_track_sd_m", "cross_track_mean_ci95_m"),
+    *("wheel_out_s", "attacks_out", "attacks_out_rate_ci95", "cross_track_max_m"),
+    *("drives", "drives_departed"),
+)
 
 
 def case_figures(
-    work: TransferWork, batch: Batch, drives: Sequence[Drive]
+    work: TransferDrives, batch: Batch, drives: Sequence[Drive]
 ) -> dict[str, Any]:
     """Summarise the drives of a batch.
 
@@ -40,7 +53,7 @@ def case_figures(
     return {**figures, "departure_rate_ci95": left}
 
 
-def make_document(work: TransferWork, figures: Figures) -> dict[str, Any]:
+def make_document(work: TransferDrives, figures: Figures) -> dict[str, Any]:
     """Return what ``transfer.json`` holds, of the rows that are whole.
 
     Args:
@@ -72,25 +85,39 @@ def make_document(work: TransferWork, figures: Figures) -> dict[str, Any]:
         },
         "attacks": [_about(found) for found in work.attacks],
         "rows": rows,
-        "columns": column_figures(rows, work.seed) if complete else [],
+        "columns": column_figures(rows, _drives(rows), work.seed) if complete else [],
         "surrogates": _surrogates(work, rows) if complete else [],
     }
 
 
 def _about(found: FoundAttack) -> dict[str, Any]:
-    scenario = found.scenario
     return {
-        "label": found.label,
+        **found.about,
         "folder": str(found.folder),
-        "scenario": scenario.name,
-        "seed": scenario.seed,
-        "route": found.route.name,
-        "policy": scenario.policy.source,
-        "objects": [item.id for item in scenario.objects],
+        "policy": found.scenario.policy.source,
         "surrogate": dict(found.surrogate),
         "departure_limit_m": found.lane.wheel_m,
-        "found_sha256": found.digest,
     }
+
+
+def read_document(folder: Path) -> dict[str, Any]:
+    """Read the finished ``transfer.json`` of a folder.
+
+    Raises:
+        InputError: it is of another kind, or rows are missing.
+    """
+    path = folder / DOCUMENT
+    document = files.read_json(path)
+    if not isinstance(document, dict) or document.get("schema") != 1:
+        raise InputError(
+            f"{path}: is not of 'mi-nerfattack transfer'; give the folder of one"
+        )
+    if not document["complete"]:
+        raise InputError(
+            f"{path}: rows are missing; the same command of 'mi-nerfattack transfer' "
+            "goes on with them"
+        )
+    return document
 
 
 def compare_rows(rows: Sequence[Row]) -> None:
@@ -115,20 +142,28 @@ def compare_rows(rows: Sequence[Row]) -> None:
         row["succeeds_in_surrogate"] = None if base is None else _is_out(base)
 
 
-def column_figures(rows: Sequence[Row], seed: int) -> list[dict[str, Any]]:
-    """Summarise each column over the attacks that have it.
+def column_figures(
+    rows: Sequence[Row], drives: pd.DataFrame, seed: int
+) -> list[dict[str, Any]]:
+    """Summarise each column over the attacks, each of which counts once.
 
     Args:
         rows: of :func:`compare_rows`.
+        drives: of these rows, with `attack`, `environment`, `condition` and `case`.
         seed: of the bootstrap.
 
     Returns:
         ``columns`` of ``transfer.json``, in the order of the rows.
     """
-    found, groups = [], {}
-    for row in rows:
-        groups.setdefault((row["environment"], row["condition"]), []).append(row)
-    for key, own in groups.items():
+    by = ["environment", "condition", "case"]
+    cases: dict[tuple[str, str], dict[str, Any]] = {}
+    for figures in records(summary(drives, by, ["attack"], seed)):
+        environment, condition, case = (figures[name] for name in by)
+        own = cases.setdefault((environment, condition), {})
+        own[case] = {name: figures[name] for name in _OF_CASE}
+    found = []
+    for key, of_case in cases.items():
+        own = [r for r in rows if (r["environment"], r["condition"]) == key]
         ratios = [r for row in own if (r := row["ratio_to_surrogate"])]
         mean = float(np.exp(np.log(ratios).mean())) if len(ratios) == len(own) else None
         found.append(
@@ -136,10 +171,7 @@ def column_figures(rows: Sequence[Row], seed: int) -> list[dict[str, Any]]:
                 "environment": key[0],
                 "condition": key[1],
                 "attacks": len(own),
-                "cases": {
-                    case: _over_attacks([row["cases"][case] for row in own], seed)
-                    for case in own[0]["cases"]
-                },
+                "cases": of_case,
                 "ratio_to_surrogate": mean,
                 "transfer": _transfer(own),
             }
@@ -147,7 +179,18 @@ def column_figures(rows: Sequence[Row], seed: int) -> list[dict[str, Any]]:
     return found
 
 
-def _surrogates(work: TransferWork, rows: Sequence[Row]) -> list[dict[str, Any]]:
+def _drives(rows: Sequence[Row]) -> pd.DataFrame:
+    found = [
+        {name: row[name] for name in ("attack", "environment", "condition")}
+        | {"case": case, **run, "departed": run["steps_departed"] > 0}
+        for row in rows
+        for case, figures in row["cases"].items()
+        for run in figures["per_run"]
+    ]
+    return pd.DataFrame(found)
+
+
+def _surrogates(work: TransferDrives, rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Summarise attacks by surrogate, the worst first; none if there is one."""
     groups: dict[str, list[FoundAttack]] = {}
     for found in work.attacks:
@@ -158,7 +201,7 @@ def _surrogates(work: TransferWork, rows: Sequence[Row]) -> list[dict[str, Any]]
     for group in groups.values():
         labels = [found.label for found in group]
         own = [row for row in rows if row["attack"] in labels]
-        columns = column_figures(own, work.seed)
+        columns = column_figures(own, _drives(own), work.seed)
         about = dict(group[0].surrogate)
         summaries.append({**about, "attacks": labels, "columns": columns})
     unknown = float("inf")
@@ -166,20 +209,6 @@ def _surrogates(work: TransferWork, rows: Sequence[Row]) -> list[dict[str, Any]]
         summaries,
         key=lambda s: unknown if s["psnr_heldout_db"] is None else s["psnr_heldout_db"],
     )
-
-
-def _over_attacks(cases: Sequence[dict[str, Any]], seed: int) -> dict[str, Any]:
-    """Summarise a case of one column over the attacks, each of which counts once."""
-    errors, out_s = (
-        np.array([case[name] for case in cases])
-        for name in ("cross_track_mean_m", "wheel_out_s")
-    )
-    return {
-        **over_attacks(errors, out_s, seed),
-        "cross_track_max_m": max(case["cross_track_max_m"] for case in cases),
-        "drives": sum(case["n"] for case in cases),
-        "drives_departed": sum(case["drives_departed"] for case in cases),
-    }
 
 
 def _transfer(rows: Sequence[Row]) -> dict[str, Any] | None:
@@ -194,3 +223,61 @@ def _transfer(rows: Sequence[Row]) -> dict[str, Any] | None:
 
 def _is_out(case: dict[str, Any]) -> bool:
     return case["wheel_out_s"] >= DEPARTED_S
+
+
+DOCUMENT, PICTURE, DRIVES = "transfer.json", "transfer.png", "drives"
+QUALITY = "quality.png"
+
+
+def check_output(folder: Path) -> None:
+    """Make the folder of a transfer; InputError if it is the one of a run."""
+    if (folder / SCENARIO).exists():
+        raise InputError(f"{folder}: is the folder of a run; choose another with -o")
+    files.make_folder(folder)
+
+
+def run_transfer(
+    work: TransferDrives,
+    output: Path,
+    workers: AbstractWorkers,
+    progress: OnSteps = lambda done, total: None,
+) -> dict[str, Any]:
+    """Do the drives that are not there yet, and summarise all.
+
+    ``transfer.json`` is written anew whenever a row is whole.
+
+    Args:
+        work: all drives, those of `output`.
+        output: the folder, see `check_output`.
+        workers: who does them.
+        progress: called with control periods done and wanted.
+
+    Returns:
+        the document that ``transfer.json`` holds.
+
+    Raises:
+        InputError: before the first drive, an environment that cannot be made, another
+            process in the folder, or a damaged drive there; later, whatever a drive
+            raises.
+    """
+    figures: dict[str, dict[str, Any]] = {}
+    document: dict[str, Any] = {"rows": None}
+
+    def on_groups(found: Groups) -> None:
+        for index, items in found.items():
+            batch = work.batches[index]
+            drives = [item.drive for item in items]
+            figures[batch.digest] = case_figures(work, batch, drives)
+        written = make_document(work, figures)
+        if written["rows"] != document["rows"]:
+            document.update(written)
+            files.write_json(output / DOCUMENT, document)
+
+    with locks.exclusive(output):
+        locks.remove_partial(output)
+        run_drives(work, workers, progress, on_groups)
+        plot_transfer(output / PICTURE, document)
+        known = [s for s in document["surrogates"] if s["psnr_heldout_db"] is not None]
+        if len(known) > 1:
+            plot_quality(output / QUALITY, document)
+    return document

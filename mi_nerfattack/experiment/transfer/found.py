@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mi_nerfattack.attack.black_box.random_looks import RandomLooks
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.experiment.baseline import random_appearance
+from mi_nerfattack.experiment.baseline import RandomAppearances
 from mi_nerfattack.experiment.run_folder import (
     CHECKPOINT,
     SCENARIO,
@@ -26,7 +24,7 @@ from mi_nerfattack.experiment.run_folder import (
 )
 from mi_nerfattack.fields import load_grid
 from mi_nerfattack.io import files
-from mi_nerfattack.io.resumable import differences, refuse
+from mi_nerfattack.io.resumable import differences, json_digest, refuse
 from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, OWN, Lane
 from mi_nerfattack.scenario.scenario import Scenario, SceneSection, load_scenario
 from mi_nerfattack.scenario.world import (
@@ -80,6 +78,18 @@ class FoundAttack:
         """Of the route."""
         return Lane.of(self.route, self.scenario.vehicle.width_m)
 
+    @property
+    def about(self) -> dict[str, Any]:
+        """What documents say of it."""
+        return {
+            "label": self.label,
+            "scenario": self.scenario.name,
+            "seed": self.scenario.seed,
+            "route": self.route.name,
+            "objects": [item.id for item in self.scenario.objects],
+            "found_sha256": self.digest,
+        }
+
     def start(self, seed: int, number: int) -> tuple[np.ndarray, int]:
         """Draw a start as the scenario draws its own, but another one.
 
@@ -110,11 +120,6 @@ class FoundAttack:
                     "starts vary (lateral_sd_m, heading_sd_deg or covariance)"
                 )
 
-    def with_objects(self, folder: Path, label: str) -> FoundAttack:
-        """Return this attack with the objects of another folder, where they stood."""
-        digest = _digest(folder, self.scenario, self.offsets)
-        return replace(self, folder=folder, label=label, digest=digest)
-
     def looks(self, world: World) -> dict[str, Appearance]:
         """Load how the objects of a world look, and where they stand, by case."""
         own = world.appearance()
@@ -129,10 +134,7 @@ class FoundAttack:
                 )
         found = {OWN: own, ATTACK: Appearance(attacked, self.offsets)}
         if self.best_random is not None:
-            freedom = self.scenario.attack.freedom.build()
-            kind, seed = self.scenario.baseline.kind, self.scenario.seed
-            looks = RandomLooks(world.fields, freedom, kind, seed)
-            found[BEST_RANDOM] = random_appearance(looks, self.best_random, own)
+            found[BEST_RANDOM] = RandomAppearances.of(world, own)(self.best_random)
         return found
 
 
@@ -175,8 +177,7 @@ def _read(folder: Path, label: str) -> FoundAttack:
 
 def _digest(folder: Path, scenario: Scenario, offsets: np.ndarray) -> str:
     sums = [files.sha256(object_path(folder, item.id)) for item in scenario.objects]
-    about = json.dumps([sums, offsets.tolist()])
-    return hashlib.sha256(about.encode()).hexdigest()
+    return json_digest([sums, offsets.tolist()])
 
 
 def _check_unchanged(checkpoint: Path, identity: Mapping[str, str]) -> None:

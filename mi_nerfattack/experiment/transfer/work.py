@@ -3,27 +3,17 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-from typing import Any
-from urllib.parse import quote
 
-from mi_nerfattack.backend.determinism import one_thread
-from mi_nerfattack.backend.versions import versions
-from mi_nerfattack.deploy.driving import drive
-from mi_nerfattack.deploy.environment import AbstractEnvironment
-from mi_nerfattack.deploy.registry import environment_versions
+from mi_nerfattack.deploy.environment import drive
+from mi_nerfattack.drives.run import AbstractDriver, AbstractDrives
+from mi_nerfattack.drives.spec import DriveSpec, identify, short_digest
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.evaluation.identity import short_digest
-from mi_nerfattack.evaluation.work import DriveRecord
-from mi_nerfattack.experiment.kept_drives import decisive
+from mi_nerfattack.experiment.cases import decisive
 from mi_nerfattack.experiment.transfer.columns import Column
 from mi_nerfattack.experiment.transfer.found import FoundAttack
-from mi_nerfattack.io import files
-from mi_nerfattack.io.resumable import Unit
 from mi_nerfattack.ranges import Count, Seed, checked
 from mi_nerfattack.rollout.drive import (
     ATTACK,
@@ -32,15 +22,13 @@ from mi_nerfattack.rollout.drive import (
     OWN,
     Drive,
 )
+from mi_nerfattack.rollout.loop import OnStep
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.scenario import is_within
 from mi_nerfattack.scenario.world import Appearance, World, build_world
-from mi_nerfattack.system.workers import AbstractWork, OnUnits
 
-FORMAT = "mi_nerfattack transfer drive 1"
 #: What objects can show, in the order of documents.
 CASES = (NO_OBJECT, OWN, BEST_RANDOM, ATTACK)
-_REMEDY = "choose another folder with -o, or remove this file"
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,16 +55,16 @@ class Batch:
 
 @dataclass(frozen=True, eq=False)
 @checked("transfer")
-class TransferWork(AbstractWork):
-    """All drives of a transfer; a piece is a batch.
+class TransferDrives(AbstractDrives):
+    """All drives of a transfer; a group is a batch.
 
     Args:
+        store: of those that are finished.
         attacks: found.
         columns: where they are driven, and the objects as they were.
         cases: of `CASES`.
         starts: drives of each batch.
         seed: of starts, images and errors.
-        folder: of the drives.
     """
 
     attacks: tuple[FoundAttack, ...]
@@ -84,10 +72,8 @@ class TransferWork(AbstractWork):
     cases: tuple[str, ...]
     starts: Count
     seed: Seed
-    folder: Path
 
     def __post_init__(self) -> None:
-        """Check what the types do not."""
         if not self.cases or len(set(self.cases)) < len(self.cases):
             raise InputError(f"--cases: {' '.join(self.cases)!r}; each once")
         for case in self.cases:
@@ -122,97 +108,66 @@ class TransferWork(AbstractWork):
         cells = [batch for row in self.rows.values() for batch in row.values()]
         return list({batch.digest: batch for batch in cells}.values())
 
-    def open(self) -> Opened:
+    @cached_property
+    def groups(self) -> Sequence[Sequence[DriveSpec]]:
+        """The drives of all batches."""
+        return [
+            [self._spec(batch, start) for start in range(self.starts)]
+            for batch in self.batches
+        ]
+
+    def open(self) -> TransferDriver:
         """Load nothing yet."""
-        return Opened(self.attacks)
+        return TransferDriver(self.attacks)
 
-    def do(self, opened: Opened, index: int, report: OnUnits) -> None:
-        """Do the drives of a batch that are not done; a unit is a control period."""
-        batch = self.batches[index]
-        found = self.attacks[batch.number]
-        for start in range(self.starts):
-            if self.path(batch, start).exists():
-                continue
-            pose, seed = found.start(self.seed, start)
-            world = opened.world(batch.number)
-            environment = opened.environment(batch, seed)
-            begun = time.monotonic()
-            with one_thread():
-                result = drive(
-                    environment,
-                    world.policy,
-                    world.route,
-                    pose,
-                    seed,
-                    world.horizon,
-                    lambda step: report(1),
-                    batch.case,
-                    start,
-                    batch.column.environment,
-                )
-            record = DriveRecord(seed=seed, wall_s=time.monotonic() - begun)
-            files.make_folder(self.path(batch, start).parent)
-            self._unit(batch, start).write(result.arrays(), record)
-
-    def close(self, opened: Opened) -> None:
-        """Close the environment."""
-        opened.close()
-
-    def path(self, batch: Batch, start: int) -> Path:
-        """Return the file of a drive."""
-        column = batch.column
-        condition = quote(column.condition.label, safe="")
-        folder = self.folder / column.environment / condition
-        name = f"{batch.case}-{batch.digest}"
-        return folder / name / f"start_{start:04d}.safetensors"
-
-    def read(self, batch: Batch) -> list[Drive | None]:
-        """Read the drives of a batch; None for one that is not done.
+    def check(self, missing: Sequence[DriveSpec]) -> None:
+        """Make every environment once in each scene under each sky, without objects.
 
         Raises:
-            InputError: a file is damaged, or of another transfer.
+            InputError: one cannot be made.
         """
-        found = self.attacks[batch.number]
-        drives: list[Drive | None] = []
-        for start in range(self.starts):
-            kept = self._unit(batch, start).read()
-            about = batch.column.environment, found.route.name, batch.case, start
-            drives.append(
-                None
-                if kept is None
-                else Drive(*about, kept.record.seed, **kept.tensors)
-            )
-        return drives
-
-    def _unit(self, batch: Batch, start: int) -> Unit[DriveRecord]:
-        identity = {**batch.identity, "start": f"{start}"}
-        return Unit(self.path(batch, start), identity, DriveRecord, _REMEDY)
+        driver, seen = self.open(), set()
+        for spec in missing:
+            batch, _ = spec.how
+            column, found = batch.column, self.attacks[batch.number]
+            scene = found.identity["scenario.scene.deployment"]
+            key = scene, column.name, column.condition.sky
+            if key not in seen:
+                seen.add(key)
+                column.open(driver.world(batch.number), [], 0).close()
+        driver.close()
 
     def _batch(self, number: int, column: Column, case: str) -> Batch:
         """Describe all that decides about drives, and nothing else."""
-        found = self.attacks[number]
         column = column.without_objects if case == NO_OBJECT else column
-        names = {**versions(), **environment_versions(column.name)}
-        identity = {
-            "format": FORMAT,
-            **{f"version.{name}": value for name, value in names.items()},
-            **_decisive(found, column, case),
-            "column": json.dumps(column.identity(), sort_keys=True),
-            "case": case,
-            "seed": f"{self.seed}",
-        }
-        return Batch(number, column, case, identity)
+        found = _decisive(self.attacks[number], column, case)
+        found |= {"column": column.identity(), "case": case, "seed": self.seed}
+        return Batch(number, column, case, identify(column.name, found))
+
+    def _spec(self, batch: Batch, start: int) -> DriveSpec:
+        found = self.attacks[batch.number]
+        pose, seed = found.start(self.seed, start)
+        return DriveSpec(
+            environment=batch.column.environment,
+            route=found.route.name,
+            case=batch.case,
+            run=start,
+            seed=seed,
+            steps=found.horizon,
+            identity={**batch.identity, "start": f"{start}"},
+            how=(batch, pose),
+        )
 
 
-class Opened:
-    """What a process needs for its drives: one world and one environment at a time."""
+class TransferDriver(AbstractDriver):
+    """Drives past found attacks: one world and one environment at a time."""
 
     def __init__(self, attacks: Sequence[FoundAttack]) -> None:
+        super().__init__()
         self._attacks = attacks
         self._number = -1
         self._world: World | None = None
         self._looks: dict[str, Appearance] = {}
-        self._opened: tuple[Any, AbstractEnvironment] | None = None
 
     def world(self, number: int) -> World:
         """Return the world of an attack."""
@@ -224,34 +179,42 @@ class Opened:
             self._looks = found.looks(world)
         return self._world
 
-    def environment(self, batch: Batch, seed: int) -> AbstractEnvironment:
-        """Return a batch's environment for one drive, the objects in their places."""
+    def drive(self, spec: DriveSpec, on_step: OnStep) -> Drive:
+        """Drive once, the objects in their places."""
+        batch, pose = spec.how
         world, column = self.world(batch.number), batch.column
         if batch.case != NO_OBJECT:
             look, errors = self._looks[batch.case], column.condition.errors
-            offsets = errors.offsets(look.offsets, seed)
+            offsets = errors.offsets(look.offsets, spec.seed)
             world.show(Appearance(look.textures, offsets))
-        key = batch.digest, seed if column.serves_one_start else None
-        if self._opened is None or self._opened[0] != key:
-            self._close_environment()
-            objects = [] if batch.case == NO_OBJECT else world.surrogate.objects
-            self._opened = key, column.open(world, objects, seed)
-        return self._opened[1]
+        objects = [] if batch.case == NO_OBJECT else world.surrogate.objects
+        key = batch.digest, spec.seed if column.serves_one_start else None
+        environment = self.environment.get(
+            key, lambda: column.open(world, objects, spec.seed)
+        )
+        return drive(
+            environment,
+            world.policy,
+            world.route,
+            pose,
+            spec.seed,
+            spec.steps,
+            on_step,
+            batch.case,
+            spec.run,
+            spec.environment,
+        )
 
     def close(self) -> None:
         """Close the environment, and forget the world."""
-        self._close_environment()
+        super().close()
         self._world, self._looks = None, {}
-
-    def _close_environment(self) -> None:
-        if self._opened is not None:
-            self._opened[1].close()
-        self._opened = None
 
 
 def _decisive(found: FoundAttack, column: Column, case: str) -> dict[str, str]:
     """Return what of a scenario, and of what was found, decides about drives."""
-    inert, named = ["deployment"], {}
+    inert: list[str] = []
+    named = {}
     if case == NO_OBJECT:
         inert.append("objects")
     if case in (ATTACK, BEST_RANDOM):

@@ -13,7 +13,7 @@ from mi_nerfattack.experiment.view.run import ViewedRun
 from mi_nerfattack.report.plots.heat import COLOUR_MAP
 from mi_nerfattack.rollout.drive import NO_OBJECT, OWN, Drive
 from mi_nerfattack.scenario.deployment import SURROGATE
-from mi_nerfattack.vehicle.state import to_state
+from mi_nerfattack.vehicle.dynamics import to_state
 
 #: Mean difference of the channels, of 255, from which on a pixel is brightest.
 FULL = 128

@@ -11,7 +11,7 @@ from scipy import ndimage
 from mi_nerfattack.deploy.environment import CameraFrame
 from mi_nerfattack.deploy.registry import kinematic_vehicle
 from mi_nerfattack.deploy.surrogate.environment import SurrogateEnvironment
-from mi_nerfattack.deploy.views.rays import PixelRays
+from mi_nerfattack.deploy.views.above import PixelRays
 from mi_nerfattack.scenario.world import World
 
 APART_M = 4.0  # between the places that are looked around from

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from mi_nerfattack.drives.store import read_drives
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.experiment.kept_drives import read_drive
 from mi_nerfattack.experiment.pictures.frames import nominal_drives
 from mi_nerfattack.experiment.run_folder import DRIVES
 from mi_nerfattack.experiment.transfer.found import FoundAttack, read_found
@@ -93,9 +93,7 @@ def read_viewed(folder: Path) -> ViewedRun:
             that its scenario names is missing or has changed.
     """
     (found,) = read_found([folder])
-    route = found.route.name
-    paths = sorted((folder / DRIVES).glob("*.safetensors"))
-    drives = tuple(read_drive(path, route) for path in paths)
+    drives = tuple(read_drives(folder / DRIVES))
     if not drives:
         raise InputError(
             f"{folder / DRIVES}: no drives; they were removed, attack anew"

@@ -233,7 +233,6 @@ class RunScene:
         return nodes
 
     def _add_lines(self) -> None:
-        """Draw the lane's centre, and the drives."""
         route = self._viewed.world.route
         self._add_line("/route", route.points, _ROUTE, _THIN_M)
         first = {id(drive) for drive in self._viewed.shown}

@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from mi_nerfattack.system.cores import cores
+from mi_nerfattack.system.machine import cores
 
 if TYPE_CHECKING:
     from mi_nerfattack.fields.ngp import NGPField

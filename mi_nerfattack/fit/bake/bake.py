@@ -26,12 +26,8 @@ from mi_nerfattack.fields.ngp import NGPField
 from mi_nerfattack.fields.occupancy import Occupancy
 from mi_nerfattack.fit.pruning import dense_octants
 from mi_nerfattack.ranges import Count, Positive, Seed, Whole, checked
-from mi_nerfattack.render.camera.intrinsics import (
-    Camera,
-    CameraMount,
-    generate_rays,
-    pose_arrays,
-)
+from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
+from mi_nerfattack.render.camera.lens import generate_rays, pose_arrays
 from mi_nerfattack.render.march import STOP
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import Rays
@@ -199,7 +195,6 @@ def _provenance(options: BakeOptions) -> dict[str, str]:
 
 
 def _places(route: Route) -> np.ndarray:
-    """Return places along a route, (n, 2), metres."""
     spacing = _SPACING * route.lane_width_m
     arcs = np.linspace(0, route.length, 2 + int(route.length / spacing))
     return route.pose_at(arcs)[:, :2]

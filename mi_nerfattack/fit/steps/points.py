@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.backend.differentiate import vjp
+from mi_nerfattack.backend.arrays import vjp
 from mi_nerfattack.backend.freeze import freeze_method
 from mi_nerfattack.fields.cpu.networks import (
     SharedRows,
@@ -68,15 +68,7 @@ class PointStep:
         self._scatter = freeze_method(self._record_scatter, self._state)
 
     def __call__(self, random: Any, limit: mi.UInt32) -> tuple[Score, Any]:
-        """Accumulate gradients of the parameters that ask for them.
-
-        Args:
-            random: `mi.PCG32`, one stream a ray.
-            limit: number of rays in use.
-
-        Returns:
-            the score, and the advanced random numbers.
-        """
+        """See :class:`~mi_nerfattack.fit.steps.march.MarchStep`, called alike."""
         size = self.field.encoding.n_output_features
         nets = networks(self.field)
         draw, listed, features, random = self._list(random, limit)

@@ -1,8 +1,8 @@
 """ONNX files as torch modules: an interpreter with the derivatives of torch.
 
-Of our own because an attack needs the derivative by the image: runtimes have none for
-inference graphs, and converters to torch need torchvision, which has no build that fits
-the CPU build of torch.
+Of our own because an attack needs the derivative by the image, and runtimes have none
+for inference graphs. The converter onnx2pytorch makes rollouts slower. Its import needs
+torchvision, whose registry build does not load with the CPU build of torch.
 """
 
 from __future__ import annotations
@@ -14,18 +14,75 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_iter, tree_map
 
 from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.io import files
 from mi_nerfattack.policy.checks import misfit
-from mi_nerfattack.policy.onnx.budget import Budget
 from mi_nerfattack.policy.onnx.call import Call
 from mi_nerfattack.policy.onnx.operators import OPERATORS
 from mi_nerfattack.system.extras import load_extra
 
+
+class Budget(TorchDispatchMode):
+    """Refuses what makes more than so many bytes of values; a context manager.
+
+    The size of a value is found by making it without memory, on torch's device
+    ``meta``. Costs about 0.1 ms an operation.
+
+    Args:
+        limit: bytes.
+    """
+
+    def __init__(self, limit: int) -> None:
+        super().__init__()
+        self.limit = self.left = limit
+
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # its import takes seconds
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
+        kwargs = kwargs or {}
+        if not func.is_view:
+            without = {**kwargs, "device": _META} if "device" in kwargs else kwargs
+            try:
+                made = func(*tree_map(_meta, args), **tree_map(_meta, without))
+            except (RuntimeError, TypeError, ValueError):
+                made = ()  # the operation itself tells, or its size is of its values
+            for value in tree_iter(made):
+                if isinstance(value, torch.Tensor):
+                    self.left -= value.numel() * value.element_size()
+            if self.left < 0:
+                raise InputError(
+                    f"its values take more than {self.limit / 1e9:.1f} GB for these "
+                    "images; export a smaller network, or give fewer or smaller images"
+                )
+        return func(*args, **kwargs)
+
+
+_META = torch.device("meta")
+
+
+def _meta(value: Any) -> Any:
+    return value.to(_META) if isinstance(value, torch.Tensor) else value
+
+
 MAX_ONNX_BYTES = 1 << 31
 MAX_VALUE_BYTES = 1 << 30  # of all nodes, an image
 _DOUBLE = 11
+#: What torch and NumPy raise where a node's values or attributes do not fit.
+_UNUSABLE = (
+    RuntimeError,
+    TypeError,
+    ValueError,
+    IndexError,
+    KeyError,
+    ArithmeticError,
+)
 _CPU = torch.device("cpu")
 
 
@@ -85,6 +142,34 @@ class OnnxNetwork(torch.nn.Module):
         self.batch: int | None = self.inputs[0].sizes[0]
         self._measured: set[tuple[torch.Size, ...]] = set()
 
+    def choose(self, name: str | None, hidden: int) -> None:
+        """Choose the output that is the control; the hidden states come after it.
+
+        Args:
+            name: of the control; None where it is the first of 1 + `hidden` outputs.
+            hidden: number of hidden states; without any, other outputs are left out.
+
+        Raises:
+            InputError: there is no such output, or their number does not fit.
+        """
+        names = self.outputs
+        if name is None and len(names) == 1 + hidden:
+            return
+        listed = ", ".join(map(repr, names))
+        if name is None or name not in names:
+            raise InputError(
+                f"{self.name}: has the outputs {listed}, and policy.output_name is "
+                f"{name!r}: give the name of the control there; policy.recurrent "
+                f"declares {hidden} hidden states"
+            )
+        rest = [other for other in names if other != name] if hidden else []
+        if len(rest) != hidden:
+            raise InputError(
+                f"{self.name}: has the outputs {listed}; beside the control {name!r} "
+                f"there must be {hidden} hidden states, as policy.recurrent declares"
+            )
+        self.outputs = [name, *rest]
+
     def forward(self, *arguments: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Evaluate all nodes; the first time of these sizes, by a budget of memory."""
         sizes = tuple(argument.shape for argument in arguments)
@@ -118,7 +203,7 @@ class OnnxNetwork(torch.nn.Module):
             return OPERATORS[node.operator](call)
         except InputError as err:
             raise InputError(f"{self.name}: node {node.name}: {err}") from err
-        except (RuntimeError, TypeError, ValueError, IndexError, KeyError) as err:
+        except _UNUSABLE as err:
             if is_interrupt(err) or isinstance(err, torch.OutOfMemoryError):
                 raise
             raise InputError(
@@ -235,7 +320,6 @@ def _opset(model: Any, name: str) -> int:
 
 
 def _node(node: Any, owner: str) -> Node:
-    """Read a node and its attributes."""
     from onnx import TensorProto
     from onnx.helper import get_attribute_value
 

@@ -14,7 +14,10 @@ import torch
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.onnx.call import Call
 
+_MOST_PX = 1 << 16  # of an axis
 
+
+@np.errstate(over="raise", divide="raise", invalid="raise")
 def resize(call: Call) -> torch.Tensor:
     """Resize the last two axes: nearest (asymmetric, floor) and linear."""
     call.only("antialias", 0)
@@ -80,6 +83,8 @@ def _targets(call: Call) -> list[tuple[int, np.float32]]:
         scales = [np.float32(new) / np.float32(old) for new, old in pairs]
     if len(sizes) != 4 or sizes[:2] != before[:2] or min(sizes) < 1:
         raise InputError(f"{call.operator}: to {sizes}; only height and width change")
+    if max(sizes[2:]) > _MOST_PX:
+        raise InputError(f"{call.operator}: to {sizes}; at most {_MOST_PX} pixels")
     return list(zip(sizes[2:], scales[2:], strict=True))
 
 

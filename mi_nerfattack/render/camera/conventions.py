@@ -19,9 +19,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
@@ -29,12 +28,16 @@ from scipy.spatial.transform import Rotation
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import Camera
 
+if TYPE_CHECKING:
+    import mitsuba as mi
+
 COLMAP_MODELS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
 """Parameters of COLMAP's camera models, in its order; pixels, distortion unitless."""
 
@@ -120,7 +123,14 @@ def from_colmap(
     values = dict(zip(names, map(float, parameters), strict=True))
     if "f" in values:
         values["fx"] = values["fy"] = values.pop("f")
-    return Camera(width, height, **values)
+    return Camera(width, height, **values, is_fisheye=model == "OPENCV_FISHEYE")
+
+
+def to_colmap(camera: Camera) -> tuple[str, dict[str, float]]:
+    """Return the model of COLMAP that a camera has, and its size and parameters."""
+    model = "OPENCV_FISHEYE" if camera.is_fisheye else "OPENCV"
+    names = ("width", "height", *COLMAP_MODELS[model])
+    return model, {name: getattr(camera, name) for name in names}
 
 
 def _colmap_names(model: str) -> tuple[str, ...]:
@@ -147,6 +157,8 @@ def mitsuba_sensor_dict(
         film: more or other properties of the `hdrfilm`, whose defaults here are
             32-bit RGB and a box filter.
     """
+    import mitsuba as mi
+
     square = abs(camera.fx / camera.fy - 1) <= _SQUARE
     stock = square and not camera.is_distorted
     return {
@@ -178,9 +190,10 @@ def _perspective(camera: Camera) -> dict[str, Any]:
 
 
 def _opencv_camera(camera: Camera) -> dict[str, Any]:
-    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-    values = {name: float(getattr(camera, name)) for name in names}
-    return {"type": "opencv_camera", **values}
+    _, values = to_colmap(camera)
+    del values["width"], values["height"]
+    lens = {name: float(value) for name, value in values.items()}
+    return {"type": "opencv_camera", "fisheye": camera.is_fisheye, **lens}
 
 
 def from_mitsuba(sensor: mi.Sensor) -> tuple[Camera, np.ndarray]:
@@ -196,11 +209,14 @@ def from_mitsuba(sensor: mi.Sensor) -> tuple[Camera, np.ndarray]:
     Raises:
         InputError: the sensor is of another kind.
     """
+    import mitsuba as mi
+
     params = mi.traverse(sensor)
     width, height = map(int, sensor.film().size())
     if "fx" in params:
-        names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-        camera = Camera(width, height, *(_number(params[name]) for name in names))
+        model = "OPENCV_FISHEYE" if "k3" in params else "OPENCV"
+        numbers = [_number(params[name]) for name in COLMAP_MODELS[model]]
+        camera = from_colmap(model, width, height, numbers)
     elif "x_fov" in params:
         focal = 0.5 * width / math.tan(math.radians(0.5 * _number(params["x_fov"])))
         shift = [

@@ -17,8 +17,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_nerfattack.backend.arrays import concat, split
-from mi_nerfattack.backend.differentiate import vjp
+from mi_nerfattack.backend.arrays import concat, split, vjp
 from mi_nerfattack.ranges import NonNegative, Whole, checked
 
 #: Standard deviations at which the blur's kernel ends.

@@ -9,6 +9,14 @@ import numpy as np
 
 from mi_nerfattack.errors import InputError
 
+#: Longest time between a frame and the tracked pose nearest to it, seconds.
+POSE_REACH_S = 0.1
+#: The same for a frame before the first pose or after the last.
+POSE_BEYOND_S = 0.05
+_CLOCK_S = 1e-6  # to which seconds since 1970 are kept
+#: Columns of a rotation whose numbers are wrong by half a thousandth each.
+_ROUNDED = 2e-3
+
 
 @dataclass(frozen=True)
 class Pose:
@@ -101,6 +109,46 @@ class Pose:
         return float(np.arctan2(self.rotation[1, 0], self.rotation[0, 0]))
 
 
+def poses_at(
+    known_s: np.ndarray, poses: np.ndarray, times_s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Interpolate poses in time: positions on a line, rotations at a constant rate.
+
+    Beyond the first and the last pose, the motion continues for half an interval and at
+    most `POSE_BEYOND_S`. Then the pose stays.
+
+    Args:
+        known_s: (n,), times of the poses, seconds, increasing.
+        poses: (n, 4, 4), rigid.
+        times_s: (m,), seconds.
+
+    Returns:
+        poses (m, 4, 4), and (m,) bool: whether a pose is known within `POSE_REACH_S`
+        of the time, beyond the ends within `POSE_BEYOND_S`.
+    """
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    after = np.clip(np.searchsorted(known_s, times_s), 1, len(known_s) - 1)
+    before = np.maximum(after - 1, 0)  # equal to `after` for a single pose
+    start, end = known_s[before], known_s[after]
+    step = np.where(end > start, end - start, 1.0)
+    beyond = np.minimum(0.5 * step, POSE_BEYOND_S)
+    reached = np.clip(times_s, start - beyond, end + beyond)
+    share = ((reached - start) / step)[:, None]
+    away = np.minimum(abs(times_s - start), abs(times_s - end))
+    is_inside = (times_s >= known_s[0]) & (times_s <= known_s[-1])
+    is_known = away < np.where(is_inside, POSE_REACH_S, POSE_BEYOND_S) + _CLOCK_S
+    first = Rotation.from_matrix(poses[before, :3, :3])
+    turn = first.inv() * Rotation.from_matrix(poses[after, :3, :3])
+    result = np.tile(np.eye(4), (len(times_s), 1, 1))
+    result[:, :3, :3] = (
+        first * Rotation.from_rotvec(share * turn.as_rotvec())
+    ).as_matrix()
+    moved = poses[after, :3, 3] - poses[before, :3, 3]
+    result[:, :3, 3] = poses[before, :3, 3] + share * moved
+    return result, is_known
+
+
 def offset_gradient(
     matrix: np.ndarray, by_matrix: np.ndarray, offset: np.ndarray
 ) -> np.ndarray:
@@ -135,8 +183,29 @@ def left_jacobian(vector: np.ndarray) -> np.ndarray:
     return np.eye(3) + first * cross + second * cross @ cross
 
 
-def check_rigid(matrix: np.ndarray, where: str) -> None:
+def nearest_rigid(matrix: np.ndarray, where: str) -> np.ndarray:
+    """Replace the rotation of a rigid pose (4, 4), rounded to three decimals.
+
+    Raises:
+        InputError: with `where`, if it is none; see `check_rigid`.
+    """
+    check_rigid(matrix, where, _ROUNDED)
+    rotation = matrix[:3, :3]
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-6:  # as it was written
+        return matrix
+    left, _, right = np.linalg.svd(rotation)
+    result = matrix.copy()
+    result[:3, :3] = left @ right
+    return result
+
+
+def check_rigid(matrix: np.ndarray, where: str, tolerance: float = 1e-3) -> None:
     """Check that a (4, 4) matrix is a rotation and a translation.
+
+    Args:
+        matrix: the pose.
+        where: for the message.
+        tolerance: of the products of the rotation's columns.
 
     Raises:
         InputError: with `where`, if it scales, shears, reflects or is not finite.
@@ -149,7 +218,7 @@ def check_rigid(matrix: np.ndarray, where: str) -> None:
     error = np.abs(rotation).max()  # whose square may overflow
     if error < 2:
         error = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if error > 1e-3:
+    if error > tolerance:
         lengths = [round(math.hypot(*column), 6) for column in rotation.T.tolist()]
         raise InputError(
             f"{where}: not a rigid pose, the columns have lengths {lengths}; they "

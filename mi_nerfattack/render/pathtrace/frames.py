@@ -22,7 +22,7 @@ from mi_nerfattack.render.camera.conventions import (
     opencv_to_mitsuba,
 )
 from mi_nerfattack.render.pathtrace.load import load_scene, named_files
-from mi_nerfattack.render.pathtrace.metadata import describe_lens, frame_metadata
+from mi_nerfattack.render.pathtrace.views import describe_lens, frame_metadata
 
 SUFFIXES = (".exr", ".png")
 Precision = Literal["half", "float"]

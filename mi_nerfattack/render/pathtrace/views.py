@@ -8,8 +8,9 @@ view into the next.
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,16 +19,69 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.backend.freeze import freeze_method
+from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.render.camera.conventions import (
     mitsuba_sensor_dict,
     opencv_to_mitsuba,
+    to_colmap,
 )
-from mi_nerfattack.render.camera.intrinsics import (
-    Camera,
-    generate_rays,
-    pose_arrays,
+from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.render.camera.lens import generate_rays, pose_arrays
+
+POSE_CONVENTION = (
+    "camera.to_world: 4x4, row by row; columns right, down, forward, position "
+    "(OpenCV); world right-handed, z up, metres"
 )
+
+
+def describe_lens(camera: Camera) -> dict[str, Any]:
+    """Return intrinsics as JSON can say them."""
+    model, values = to_colmap(camera)
+    return {"type": model, **values}
+
+
+def frame_metadata(
+    lens: Mapping[str, Any],
+    camera_to_world: np.ndarray,
+    seed: int,
+    spp: int | None,
+    digests: Mapping[str, str],
+    **more: Any,
+) -> dict[str, str]:
+    """Describe a frame: where it was seen from, and what it was made of.
+
+    Args:
+        lens: from `describe_lens`, or whatever describes another one.
+        camera_to_world: (4, 4), OpenCV axes, metres.
+        seed: of what is random in it.
+        spp: samples per pixel; None where the frame is not made of samples.
+        digests: SHA-256 of what it shows, by name.
+        more: whatever else is known, as JSON can say it, e.g. ``time_s=0.4``; None is
+            left out.
+
+    Returns:
+        by name, JSON but for what is text itself: ``camera`` with its ``to_world``,
+        ``pose_convention``, ``seed``, ``spp``, ``variant``, ``versions``, ``digests``
+        and `more`.
+    """
+    # nine digits tell all 32-bit numbers apart; no -0
+    rows = [[float(f"{value + 0:.9g}") for value in row] for row in camera_to_world]
+    found = {
+        "camera": {**lens, "to_world": rows},
+        "pose_convention": POSE_CONVENTION,
+        "seed": seed,
+        "spp": spp,
+        "variant": mi.variant(),
+        "versions": versions(),
+        "digests": dict(sorted(digests.items())),
+        **more,
+    }
+    return {
+        name: value if isinstance(value, str) else json.dumps(value)
+        for name, value in found.items()
+        if value is not None
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +126,6 @@ class ViewRenderer:
     """
 
     def __init__(self, scene: Any, camera: Camera, integrator: Any = None) -> None:
-        """Build the sensor."""
         film = {"pixel_format": "rgba"}
         self.scene, self.camera = scene, camera
         self._integrator = scene.integrator() if integrator is None else integrator
@@ -165,6 +218,11 @@ def iterate_views(
         integrator: `mi.Integrator`; None for the scene's own.
     """
     renderer = ViewRenderer(scene, camera, integrator)
-    seeds = np.random.SeedSequence(seed).generate_state(len(camera_to_world))
+    seeds = view_seeds(seed, len(camera_to_world))
     for matrix, view_seed in zip(camera_to_world, seeds, strict=True):
-        yield renderer.render(matrix, spp, int(view_seed))
+        yield renderer.render(matrix, spp, view_seed)
+
+
+def view_seeds(seed: int, n: int) -> list[int]:
+    """Return the seeds of the samples of n views."""
+    return np.random.SeedSequence(seed).generate_state(n).tolist()

@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from mi_nerfattack.fit.bake.scores import BakedView
+from mi_nerfattack.fit.scores import ViewScore, least, mean, worst_views
 from mi_nerfattack.io import files
-from mi_nerfattack.report.pages.elements import render
-from mi_nerfattack.report.pages.fit import finite
-from mi_nerfattack.report.plots.views import ViewPair, write_colours, write_depths
+from mi_nerfattack.io.strict import finite
+from mi_nerfattack.report.columns import Column, Table
+from mi_nerfattack.report.pages.sections import Picture, write_report
+from mi_nerfattack.report.plots.views import write_colours, write_depths
 
-_SCORES = ("psnr_db", "ssim", "depth_m")
+_VIEWS = (
+    Column("route", "{route}"),
+    Column("m along", "{arc_m:.1f}"),
+    Column("m beside", "{lateral_m:+.2g}"),
+    Column("PSNR dB", "{psnr_db:.2f}"),
+    Column("SSIM", "{ssim:.4f}"),
+    Column("depth, cm", "{depth_median_m:.1%}"),
+)
 
 
 def write_bake_report(
-    folder: Path,
-    views: Sequence[BakedView],
-    facts: dict[str, Any],
-    title: str,
+    folder: Path, views: Sequence[ViewScore], facts: Mapping[str, Any], title: str
 ) -> Path:
     """Write `report.html`, `metrics.json`, `worst.png` and `depth.png`.
 
@@ -35,57 +39,47 @@ def write_bake_report(
         Path of the page, which is written last.
     """
     root = files.make_folder(folder)
-    kept = [view for view in views if view.pictures is not None]
-    worst = [_pair(view) for view in sorted(kept, key=lambda view: view.psnr_db)]
-    write_colours(root / "worst.png", worst, "field", "bricks")
-    write_depths(root / "depth.png", worst, titles=("bricks", "field"))
+    colours, depths = root / "worst.png", root / "depth.png"
+    write_colours(colours, worst_views(views), "field", "bricks")
+    write_depths(depths, worst_views(views), titles=("bricks", "field"))
     entries = [
-        {
-            name: getattr(view, name)
-            for name in ("route", "arc_m", "lateral_m", *_SCORES)
-        }
+        view.entry("route arc_m lateral_m psnr_db ssim")
+        | {"depth_m": view.depth_median_m}
         for view in views
     ]
-    document = {**facts, **bake_summary(views), "per_view": entries}
-    files.write_json(root / "metrics.json", finite(document))
-    text = render(
-        "bake.html.j2",
-        title=title,
-        verdict=bake_verdict(views),
-        facts=facts,
-        views=sorted(views, key=lambda view: view.psnr_db),
-        root=root,
-    )
-    files.write_text(root / "report.html", text)
-    return root / "report.html"
+    ranked = sorted(views, key=lambda view: view.psnr_db)
+    sections = {
+        "Worst views": [
+            Picture("field, bricks, and their difference", colours),
+            Picture("depth of the bricks, of the field, and their difference", depths),
+        ],
+        "All views": [Table.of(map(vars, ranked), _VIEWS)],
+        "The bake": [{name: str(value) for name, value in facts.items()}],
+    }
+    metrics = {**facts, **bake_summary(views), "per_view": entries}
+    return write_report(root, title, bake_verdict(views), metrics, sections)
 
 
-def bake_summary(views: Sequence[BakedView]) -> dict[str, Any]:
+def bake_summary(views: Sequence[ViewScore]) -> dict[str, Any]:
     """Return the means over views, None where nothing is known, and the least PSNR."""
-    means = {}
-    for name in _SCORES:
-        values = np.array([getattr(view, name) for view in views])
-        known = values[~np.isnan(values)]
-        means[name] = float(known.mean()) if known.size else None
-    return {**means, "psnr_least_db": min(view.psnr_db for view in views)}
-
-
-def bake_verdict(views: Sequence[BakedView]) -> str:
-    """Sum up in words how far bricks and field agree."""
-    found = bake_summary(views)
-    depth = found["depth_m"]
-    far = "" if depth is None else f"; depths differ by {100 * depth:.1f} cm"
-    return (
-        f"On {len(views)} views along the routes and beside, the bricks are "
-        f"{found['psnr_db']:.1f} dB from the field on average and "
-        f"{found['psnr_least_db']:.1f} dB at worst (SSIM {found['ssim']:.3f}){far}."
+    return finite(
+        {
+            "psnr_db": mean(views, "psnr_db"),
+            "ssim": mean(views, "ssim"),
+            "depth_m": mean(views, "depth_median_m"),
+            "psnr_least_db": least(views, "psnr_db"),
+        }
     )
 
 
-def _pair(view: BakedView) -> ViewPair:
-    assert view.pictures is not None
-    wanted, shown = view.pictures
-    title = f"{view.route}, {view.arc_m:.1f} m, {view.lateral_m:+.2g} m beside"
-    title = f"{title}: {view.psnr_db:.2f} dB, SSIM {view.ssim:.3f}"
-    known = np.where(wanted.opacity > 0.5, wanted.depth, np.inf)
-    return ViewPair(title, wanted.image, shown.image, shown.opacity, shown.depth, known)
+def bake_verdict(views: Sequence[ViewScore]) -> str:
+    """Sum up in words how far bricks and field agree."""
+    depth = 100 * mean(views, "depth_median_m")
+    far = "" if math.isnan(depth) else f"; depths differ by {depth:.1f} cm"
+    psnr, ssim = mean(views, "psnr_db"), mean(views, "ssim")
+    worst = least(views, "psnr_db")
+    return (
+        f"On {len(views)} views along the routes and beside, the bricks are {psnr:.1f} "
+        f"dB from the field on average and {worst:.1f} dB at worst (SSIM {ssim:.3f})"
+        f"{far}."
+    )

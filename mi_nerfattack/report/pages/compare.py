@@ -7,22 +7,30 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import rich.box
-from matplotlib.lines import Line2D
-from rich.table import Table
-
-from mi_nerfattack.evaluation.field_and_scene import (
-    ComparedFrame,
-    Comparison,
-    RouteComparison,
-)
-from mi_nerfattack.fit.scores import HAZY
+from mi_nerfattack.evaluation.field_and_scene import Comparison, RouteComparison
+from mi_nerfattack.fit.scores import HAZY, worst_views
 from mi_nerfattack.io import files
-from mi_nerfattack.report.pages.elements import render
-from mi_nerfattack.report.pages.fit import finite
-from mi_nerfattack.report.plots.charts import PALETTE, chart
-from mi_nerfattack.report.plots.views import ViewPair, write_colours, write_depths
+from mi_nerfattack.io.strict import finite
+from mi_nerfattack.report.columns import Column, Table
+from mi_nerfattack.report.pages.sections import Block, Picture, write_report
+from mi_nerfattack.report.plots.views import write_along, write_colours, write_depths
 
+_PSNR, _DEPTH = "PSNR (dB)\nmean / min", "depth error (m)\nmedian / 90 %"
+_HOLES = "holes\n(%)"
+_ROUTES = (
+    Column("route", "{name}"),
+    Column(_PSNR, "{psnr_mean_db:.1f} / {psnr_min_db:.1f}"),
+    Column("SSIM\nmean / min", "{ssim_mean:.2f} / {ssim_min:.2f}"),
+    Column(_DEPTH, "{depth_median_m:.3f} / {depth_p90_m:.3f}"),
+    Column(
+        "relative (%)\nmed. / 90 %",
+        "{depth_median_relative:.1%} / {depth_p90_relative:.1%}",
+    ),
+    Column("wrong\n(%)", "{wrong_opacity:.2%}"),
+    Column(_HOLES, "{holes:.2%}"),
+    Column("hazy\n(%)", "{hazy:.2%}"),
+)
+_STATION = "arc_m psnr_db ceiling_db ssim depth_median_m depth_p90_m wrong hazy holes"
 MIN_PSNR_DB = 26.0  # mean along a route
 MAX_DEPTH_M = 0.1  # median error along a route, near the camera
 MAX_HOLES = 0.005  # share of the scene's surfaces, mean along a route
@@ -40,37 +48,38 @@ def write_compare_report(folder: Path, comparison: Comparison, title: str) -> Pa
         Path of the page, which is written last.
     """
     root = files.make_folder(folder)
-    files.write_json(root / "metrics.json", document(comparison))
-    write_along(root / "along.png", comparison)
-    text = render(
-        "compare.html.j2",
-        title=title,
-        verdict=verdict(comparison),
-        columns=COLUMNS,
-        rows=list(zip(rows(comparison), map(_bad, comparison.routes), strict=True)),
-        settings=settings_line(comparison),
-        along=root / "along.png",
-        frames=[_frames(root, route) for route in comparison.routes if route.worst],
+    limits = {"psnr_db": MIN_PSNR_DB, "depth_median_m": MAX_DEPTH_M}
+    write_along(root / "along.png", comparison.routes, limits)
+    sections: dict[str, list[Block]] = {
+        "Routes": [routes_table(comparison), settings_line(comparison)],
+        "Along the routes": [
+            Picture("agreement frame by frame", root / "along.png"),
+        ],
+    }
+    for route in comparison.routes:
+        if worst := worst_views(route.stations):
+            stem = "".join(c if c.isalnum() or c in "-_" else "_" for c in route.name)
+            colours, depths = root / f"{stem}_worst.png", root / f"{stem}_depth.png"
+            write_colours(colours, worst, "scene, path-traced")
+            write_depths(depths, worst)
+            text = "depth of the field, of the scene, and their difference"
+            sections[f"Worst frames of {route.name}"] = [
+                Picture("scene, field, and their difference", colours),
+                Picture(text, depths),
+            ]
+    return write_report(
+        root, title, verdict(comparison), document(comparison), sections
     )
-    files.write_text(root / "report.html", text)
-    return root / "report.html"
 
 
 def document(comparison: Comparison) -> dict[str, Any]:
     """Return a comparison as JSON has it; what is not finite becomes null."""
-    options = comparison.options
+    settings = asdict(comparison.options)
+    del settings["worst"]
     table = {
         "routes": {route.name: _route_entry(route) for route in comparison.routes},
-        "settings": {
-            "camera": asdict(options.camera),
-            "mount": asdict(options.mount),
-            "spacing_m": options.spacing_m,
-            "lateral_m": options.lateral_m,
-            "spp": options.spp,
-            "near_m": options.near_m,
-            "seed": options.seed,
-        },
-        "close_enough": not _far(comparison),
+        "settings": settings,
+        "close_enough": not any(map(_faults, comparison.routes)),
         "wall_s": comparison.wall_s,
     }
     return finite(table)
@@ -93,7 +102,7 @@ def _route_entry(route: RouteComparison) -> dict[str, Any]:
         "wrong_opacity": route.mean("wrong"),
         "holes": route.mean("holes"),
         "hazy": route.mean("hazy"),
-        "stations": [asdict(station) for station in route.stations],
+        "stations": [station.entry(_STATION) for station in route.stations],
     }
 
 
@@ -104,7 +113,7 @@ def verdict(comparison: Comparison) -> str:
         f"error of at most {MAX_DEPTH_M:g} m within {comparison.options.near_m:g} m, "
         f"and holes in at most {100 * MAX_HOLES:g} % of the scene's surfaces"
     )
-    far = _far(comparison)
+    far = [route.name for route in comparison.routes if _faults(route)]
     if not far:
         return f"Close enough: {wanted}."
     noisy = [route.name for route in comparison.routes if _is_noise(route)]
@@ -124,41 +133,22 @@ def verdict(comparison: Comparison) -> str:
     )
 
 
-def _far(comparison: Comparison) -> list[str]:
-    return [
-        route.name
-        for route in comparison.routes
-        if not (_is_psnr_good(route) and _is_geometry_good(route))
-    ]
+def _faults(route: RouteComparison) -> list[str]:
+    """Return the columns in which a route is too far off.
 
-
-def _is_psnr_good(route: RouteComparison) -> bool:
-    return route.mean("psnr_db") >= MIN_PSNR_DB
+    What is unknown is no fault: there is nothing near, or there are no surfaces.
+    """
+    faults = [] if route.mean("psnr_db") >= MIN_PSNR_DB else [_PSNR]
+    faults += [_DEPTH] if route.depth_median_m > MAX_DEPTH_M else []
+    return faults + ([_HOLES] if route.mean("holes") > MAX_HOLES else [])
 
 
 def _is_noise(route: RouteComparison) -> bool:
     """Whether the noise of the scene's frames is all that is wrong with a route."""
-    if _is_psnr_good(route) or not _is_geometry_good(route):
-        return False
     error, noise = (
         10 ** (-0.1 * route.mean(name)) for name in ("psnr_db", "ceiling_db")
     )
-    return error - noise <= 10 ** (-0.1 * MIN_PSNR_DB)
-
-
-def _is_depth_good(route: RouteComparison) -> bool:
-    """A route with nothing near has no depth to be wrong."""
-    return math.isnan(route.depth_median_m) or route.depth_median_m <= MAX_DEPTH_M
-
-
-def _is_solid(route: RouteComparison) -> bool:
-    """A route without surfaces has none to see through."""
-    holes = route.mean("holes")
-    return math.isnan(holes) or holes <= MAX_HOLES
-
-
-def _is_geometry_good(route: RouteComparison) -> bool:
-    return _is_depth_good(route) and _is_solid(route)
+    return _faults(route) == [_PSNR] and error - noise <= 10 ** (-0.1 * MIN_PSNR_DB)
 
 
 def settings_line(comparison: Comparison) -> str:
@@ -181,128 +171,10 @@ def settings_line(comparison: Comparison) -> str:
     )
 
 
-def rows(comparison: Comparison) -> list[list[str]]:
-    """Return the cells of a table of the routes, below `COLUMNS`."""
-    result = []
-    for route in comparison.routes:
-        metres = f"{_number(route.depth_median_m, 3)} / {_number(route.depth_p90_m, 3)}"
-        relative = _number(100 * route.depth_median_relative, 1)
-        relative += f" / {_number(100 * route.depth_p90_relative, 1)}"
-        result.append(
-            [
-                route.name,
-                f"{route.mean('psnr_db'):.1f} / {route.least('psnr_db'):.1f}",
-                f"{route.mean('ssim'):.2f} / {route.least('ssim'):.2f}",
-                metres,
-                relative,
-                f"{100 * route.mean('wrong'):.2f}",
-                _number(100 * route.mean("holes"), 2),
-                f"{100 * route.mean('hazy'):.2f}",
-            ]
-        )
-    return result
-
-
-_PSNR, _DEPTH = "PSNR (dB)\nmean / min", "depth error (m)\nmedian / 90 %"
-_HOLES = "holes\n(%)"
-COLUMNS = (
-    "route",
-    _PSNR,
-    "SSIM\nmean / min",
-    _DEPTH,
-    "relative (%)\nmed. / 90 %",
-    "wrong\n(%)",
-    _HOLES,
-    "hazy\n(%)",
-)
-
-
 def routes_table(comparison: Comparison) -> Table:
-    """Return the figures of the routes as a table for a terminal."""
-    table = Table(box=rich.box.SIMPLE_HEAD, pad_edge=False, padding=0)
-    for i, name in enumerate(COLUMNS):
-        table.add_column(name, justify="right" if i else "left", no_wrap=i > 0)
-    for cells in rows(comparison):
-        table.add_row(*cells)
-    return table
-
-
-def _number(value: float, digits: int) -> str:
-    if math.isnan(value):
-        return "–"
-    return "nothing shown" if math.isinf(value) else f"{value:.{digits}f}"
-
-
-def _bad(route: RouteComparison) -> set[int]:
-    """Return the columns in which a route is too far off."""
-    good = {
-        _PSNR: _is_psnr_good(route),
-        _DEPTH: _is_depth_good(route),
-        _HOLES: _is_solid(route),
-    }
-    return {COLUMNS.index(name) for name in good if not good[name]}
-
-
-def _frames(root: Path, route: RouteComparison) -> tuple[str, Path, Path]:
-    """Write the worst frames of a route; return its name and the two pictures."""
-    views = [_pair(frame) for frame in route.worst]
-    colours, depths = (
-        root / f"{_file_name(route.name)}_{kind}.png" for kind in ("worst", "depth")
-    )
-    write_colours(colours, views, "scene, path-traced")
-    write_depths(depths, views)
-    return route.name, colours, depths
-
-
-def _file_name(name: str) -> str:
-    return "".join(c if c.isalnum() or c in "-_" else "_" for c in name)
-
-
-def _pair(frame: ComparedFrame) -> ViewPair:
-    at = frame.station
-    title = f"at {at.arc_m:.1f} m: {at.psnr_db:.2f} dB, SSIM {at.ssim:.3f}"
-    shown = frame.field
-    return ViewPair(
-        title, frame.image, shown.image, shown.opacity, shown.depth, frame.depth
-    )
-
-
-def write_along(path: str | Path, comparison: Comparison) -> None:
-    """Plot PSNR, SSIM, depth error and wrong opacity against the arc length."""
-    with chart(path, 7.2) as figure:
-        axes = figure.subplots(4, 1, sharex=True)
-        labels = ("PSNR (dB)", "SSIM", "depth error (m)", "rays (%)")
-        handles: list[Any] = []
-        for i, route in enumerate(comparison.routes):
-            style = {"color": PALETTE[i % len(PALETTE)], "linewidth": 1.6}
-            handles.append(Line2D([], [], label=route.name, **style))
-            arc = [station.arc_m for station in route.stations]
-            for axis, name, dash, factor in _LINES:
-                values = [factor * getattr(at, name) for at in route.stations]
-                axes[axis].plot(arc, values, linestyle=dash, **style)
-        for axis, label in zip(axes, labels, strict=True):
-            axis.set_ylabel(label)
-            axis.grid(alpha=0.25)
-        axes[0].axhline(MIN_PSNR_DB, color="black", linewidth=1, linestyle=":")
-        axes[2].axhline(MAX_DEPTH_M, color="black", linewidth=1, linestyle=":")
-        axes[2].set_ylim(bottom=0)
-        axes[3].set_ylim(bottom=0)
-        _title(axes[2], "solid: median; dashed: 90 % of the near rays")
-        _title(axes[3], "solid: wrong opacity; dashed: hazy")
-        axes[-1].set_xlabel("arc length (m)")
-        figure.align_ylabels()
-        figure.legend(handles=handles, loc="outside upper center", ncols=6)
-
-
-_LINES = (
-    (0, "psnr_db", "-", 1.0),
-    (1, "ssim", "-", 1.0),
-    (2, "depth_median_m", "-", 1.0),
-    (2, "depth_p90_m", "--", 1.0),
-    (3, "wrong", "-", 100.0),
-    (3, "hazy", "--", 100.0),
-)
-
-
-def _title(axis: Any, text: str) -> None:
-    axis.set_title(text, loc="right", fontsize=8, color="#555555")
+    """Return a table with the figures of each route."""
+    rows = [
+        {**_route_entry(route), "name": route.name, "bad": _faults(route)}
+        for route in comparison.routes
+    ]
+    return Table.of(rows, _ROUTES)

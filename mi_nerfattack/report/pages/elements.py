@@ -1,33 +1,38 @@
-"""Pages from the templates of this folder; HTML needs no network and no other file."""
+"""HTML pages from the templates of this folder, their parts and their pictures."""
 
 from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
 
 from mi_nerfattack.io import files
+from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT, RANDOM
 
 _EXACT_BYTES = 200_000  # on a page, of an image whose pixels are kept as they are
 _QUALITY = 85  # of larger ones
-# What ends a cell of a table or begins an element, and how Markdown shows it.
-_IN_MARKDOWN = str.maketrans({"&": "&amp;", "<": "&lt;", "|": "\\|", "\n": " "})
+#: Largest width of a picture; wider ones are made smaller.
+WIDTH_PX = 336
+SHEET_QUALITY = 70  # of WebP
+_MOST_PX = 16_383  # of an edge, in WebP
 
 
 def render(template: str, **values: Any) -> str:
-    """Fill in a template; every value is escaped for its format.
+    """Fill in a template; every value is escaped.
 
     Args:
-        template: ``NAME.html.j2`` or ``NAME.md.j2`` in the folder `templates`.
+        template: ``NAME.html.j2`` in the folder `templates`.
         values: all that it names.
     """
-    environment = _MARKDOWN if template.endswith(".md.j2") else _HTML
-    return environment.get_template(template).render(values)
+    return _HTML.get_template(template).render(values)
 
 
 def address(image: Image.Image, kind: str = "WEBP", **options: Any) -> Markup:
@@ -57,16 +62,76 @@ def _embedded(path: str | Path) -> Markup:
     return Markup(size).format(*image.size, source)
 
 
-def _in_markdown(value: Any) -> Markup:
-    """Escape a value; what a macro returns is escaped already."""
-    if isinstance(value, Markup):
-        return value
-    return Markup(str(value).translate(_IN_MARKDOWN))
+@dataclass(frozen=True)
+class Pane:
+    """One of the pictures that change together.
+
+    Attributes:
+        title: above it.
+        alt: what is to be seen, for those who cannot see it.
+        sheet: address of one image that holds all pictures, below each other.
+        width: of a picture, pixels.
+        height: likewise.
+        labels: a line a picture.
+    """
+
+    title: str
+    alt: str
+    sheet: Markup
+    width: int
+    height: int
+    labels: tuple[str, ...]
 
 
-def _code(value: str) -> Markup:
-    """Return text as Markdown's code, in which only its own mark and `|` count."""
-    return Markup("`" + value.replace("`", "'").replace("|", "\\|") + "`")
+@dataclass(frozen=True)
+class Scrubber:
+    """Panes of as many pictures each, beside each other.
+
+    Attributes:
+        title: of them all.
+        panes: at least one.
+        start: index of the picture that is shown first.
+        period_s: seconds that a picture is shown for when they play.
+    """
+
+    title: str
+    panes: tuple[Pane, ...]
+    start: int
+    period_s: float
+
+    @property
+    def count(self) -> int:
+        """Pictures of a pane."""
+        return len(self.panes[0].labels)
+
+    @property
+    def size_kb(self) -> int:
+        """Of all pictures, on the page."""
+        return round(sum(len(pane.sheet) for pane in self.panes) / 1000)
+
+
+def make_pane(
+    title: str, alt: str, images: Sequence[np.ndarray], labels: Sequence[str]
+) -> Pane:
+    """Lay pictures below each other in one image.
+
+    Args:
+        title: of the pane.
+        alt: what is to be seen.
+        images: sRGB, (height, width, 3), uint8, of one size; at least one. Those wider
+            than `WIDTH_PX`, or too tall to lie in one image, are made smaller.
+        labels: a line an image.
+    """
+    height, width = images[0].shape[:2]
+    scale = min(1.0, WIDTH_PX / width, _MOST_PX // len(images) / height)
+    size = max(1, int(width * scale)), max(1, int(height * scale))
+    sheet = Image.new("RGB", (size[0], size[1] * len(images)))
+    for number, image in enumerate(images):
+        shown = Image.fromarray(image[..., :3])
+        if shown.size != size:
+            shown = shown.resize(size, Image.Resampling.LANCZOS)
+        sheet.paste(shown, (0, size[1] * number))
+    return Pane(title, alt, address(sheet, quality=SHEET_QUALITY), *size, tuple(labels))
 
 
 _HTML = Environment(
@@ -77,5 +142,111 @@ _HTML = Environment(
     lstrip_blocks=True,
     keep_trailing_newline=True,
 )
-_HTML.filters |= {"embedded": _embedded, "code": _code}
-_MARKDOWN = _HTML.overlay(finalize=_in_markdown)
+_HTML.filters["embedded"] = _embedded
+
+
+#: Cases that stand beside each other.
+SHOWN_CASES = (NO_OBJECT, RANDOM, ATTACK)
+#: Sections of a page that have pictures of each run, with what the folder may lack.
+ABOVE, COST, SEEN, TEXTURES, WHEN = "above", "cost", "seen", "textures", "when"
+
+
+@dataclass(frozen=True, eq=False)
+class RunPart:
+    """A finished run, as a page shows it.
+
+    Attributes:
+        label: that tells it from the others.
+        document: as of `metrics.metrics_document`, with all that follows.
+        scenario: the scenario file as run.
+        made_with: version of each program by its name.
+        digests: SHA-256 of files by their keys.
+        repeat: the command that makes the run again.
+        pictures: image files by title, by section.
+        scrubbers: by section.
+        missing: by section, why there is nothing, and what makes it.
+    """
+
+    label: str
+    document: Mapping[str, Any]
+    scenario: str
+    made_with: Mapping[str, str]
+    digests: Mapping[str, str]
+    repeat: str
+    pictures: Mapping[str, Mapping[str, Path]]
+    scrubbers: Mapping[str, Sequence[Scrubber]]
+    missing: Mapping[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class SweepPart:
+    """A sweep.
+
+    Attributes:
+        label: that tells it from the others.
+        document: as of `sweep.summary.summarise`.
+        attacks: a row for each cell and environment: labels, figures by case, and the
+            command that repeats it.
+        shown: of each route and method the cell of middle damage.
+        pictures: image files by title.
+        notes: what is missing, and what makes it.
+    """
+
+    label: str
+    document: Mapping[str, Any]
+    attacks: Sequence[dict[str, Any]]
+    shown: Sequence[RunPart]
+    pictures: Mapping[str, Path]
+    notes: Sequence[str]
+
+
+@dataclass(frozen=True, eq=False)
+class TransferPart:
+    """A transfer.
+
+    Attributes:
+        label: that tells it from the others.
+        document: whole, as of `transfer.figures.make_document`.
+        quality: plot against the quality of surrogates, None without.
+    """
+
+    label: str
+    document: Mapping[str, Any]
+    quality: Path | None
+
+
+@dataclass(frozen=True, eq=False)
+class RetrainPart:
+    """A retraining.
+
+    Attributes:
+        label: that tells it from the others.
+        document: with `table`, of `retrain.compare.table_rows`.
+    """
+
+    label: str
+    document: Mapping[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """All that a page shows.
+
+    Attributes:
+        runs: that were named one by one.
+        sweeps: likewise.
+        transfers: likewise.
+        retrainings: likewise.
+        damage: plots of several attacks by title.
+    """
+
+    runs: Sequence[RunPart] = ()
+    sweeps: Sequence[SweepPart] = ()
+    transfers: Sequence[TransferPart] = ()
+    retrainings: Sequence[RetrainPart] = ()
+    damage: Mapping[str, Path] = field(default_factory=dict)
+
+    @property
+    def shown(self) -> list[RunPart]:
+        """Runs of which there are pictures: all that were named, some of each sweep."""
+        return [*self.runs, *(run for sweep in self.sweeps for run in sweep.shown)]

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from mi_nerfattack.capture.posed_images import PosedImages, held_out
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fit.options import FitProgress, FitResult
-from mi_nerfattack.fit.scores import SOLID, ViewScore, reference, worst_views
+from mi_nerfattack.fit.scores import ViewScore, mean, worst_views
 from mi_nerfattack.io import files
+from mi_nerfattack.io.strict import finite
 from mi_nerfattack.render.camera.conventions import opencv_to_opengl
-from mi_nerfattack.report.pages.elements import render
+from mi_nerfattack.report.columns import Column, Table
+from mi_nerfattack.report.pages.sections import Picture, write_report
 from mi_nerfattack.report.pages.verdict import (
     OBJECT,
     SCENE,
@@ -27,21 +27,28 @@ from mi_nerfattack.report.pages.verdict import (
 )
 from mi_nerfattack.report.plots.fit import write_curve, write_histogram
 from mi_nerfattack.report.plots.views import (
-    ViewPair,
     abs_difference,
     write_colours,
     write_depths,
 )
 
-_SHOWN_VIEWS = 4
+_CRITERIA = (
+    Column("measured", "{name}"),
+    Column("value", "{value:.4g}"),
+    Column("limit", "at {side} {limit:g}"),
+    Column("", "{met}"),
+)
+_VIEWS = (
+    Column("held-out view", "{name}"),
+    Column("PSNR (dB)", "{psnr_db:.2f}"),
+    Column("SSIM", "{ssim:.4f}"),
+    Column("hazy (%)", "{hazy:.1%}"),
+    Column("holes (%)", "{holes:.1%}"),
+)
 
 
 def write_fit_report(
-    folder: Path,
-    result: FitResult,
-    images: PosedImages,
-    depth: np.ndarray | None,
-    title: str,
+    folder: Path, result: FitResult, images: PosedImages, title: str
 ) -> Path:
     """Write `report.html`, `metrics.json`, `worst.png`, `depth.png`, ... of a fit.
 
@@ -51,45 +58,75 @@ def write_fit_report(
         folder: made if needed; files of these names are replaced.
         result: of the fit.
         images: that were fitted to.
-        depth: (n, height, width), metres along the ray, infinite where nothing is
-            known; None if there is none.
         title: of the page.
 
     Returns:
         Path of the page, which is written last.
     """
     root = files.make_folder(folder)
-    fitted_db = _fitted_db(result.history)
-    criteria = judge_fit(result)
-    worst = worst_views(result.per_view, _SHOWN_VIEWS)
-    shown = [_pair(score, images, depth) for score in worst]
-    depth_m = _depth_error(shown)
-    write_colours(root / "worst.png", shown, "image")
-    write_depths(root / "depth.png", shown, _unit(result))
+    criteria, worst = judge_fit(result), worst_views(result.per_view)
+    fitted_db, depth_m = _fitted_db(result.history), _depth_error(worst)
+    write_colours(root / "worst.png", worst, "image")
+    write_depths(root / "depth.png", worst, _unit(result))
     write_curve(root / "curve.png", result.history, result.psnr_heldout_db)
     write_histogram(root / "views.png", result.per_view)
-    document = summary(result) | {
+    write_cameras(root / "cameras.json", result, images)
+    metrics = summary(result) | {
         "psnr_fitted_db": fitted_db,
         "depth_error_median_m": depth_m,
-        "criteria": [_entry(item) for item in criteria],
+        "criteria": [
+            {key: getattr(item, key) for key in ("name", "value", "limit", "at_least")}
+            | {"met": item.met}
+            for item in criteria
+        ],
         "good_enough": all(item.met for item in criteria),
         "settings": result.field.metadata(),
     }
-    files.write_json(root / "metrics.json", finite(document))
-    text = render(
-        "fit.html.j2",
-        title=title,
-        root=root,
-        verdict=verdict(criteria),
-        criteria=criteria,
-        facts=_facts(result, fitted_db, depth_m),
-        has_depth=depth is not None,
-        scores=sorted(result.per_view, key=lambda score: score.psnr_db),
-        settings=result.field.metadata(),
-    )
-    write_cameras(root / "cameras.json", result, images)
-    files.write_text(root / "report.html", text)
-    return root / "report.html"
+    about, depth = "Of the worst views", "depth of the field"
+    if any(view.pictures and view.pictures.depth is None for view in worst):
+        about += "; there is no depth to compare with"
+    else:
+        depth += ", depth that was given, and their difference"
+    sections = {
+        "Criteria": [_judged(criteria)],
+        "Summary": [_facts(result, fitted_db, depth_m)],
+        "Worst held-out views": [
+            Picture("image, field, and their difference", root / "worst.png")
+        ],
+        "Depth": [
+            f"{about}. Grey: the field stops less than half of the light, or no depth "
+            "is known.",
+            Picture(depth, root / "depth.png"),
+        ],
+        "The fit": [Picture("loss and PSNR, single and averaged", root / "curve.png")],
+        "All held-out views": [
+            Picture("held-out views by PSNR", root / "views.png"),
+            scores_table(result),
+        ],
+        "Settings": [result.field.metadata()],
+    }
+    return write_report(root, title, verdict(criteria), metrics, sections)
+
+
+def _judged(criteria: Sequence[Criterion]) -> Table:
+    """Set what a fit reached beside what it should."""
+    rows = [
+        {
+            **vars(item),
+            "side": "least" if item.at_least else "most",
+            "met": "met" if item.met else "not met",
+            "bad": () if item.met else ("value",),
+        }
+        for item in criteria
+    ]
+    return Table.of(rows, _CRITERIA)
+
+
+def scores_table(result: FitResult) -> Table:
+    """Return the scores of the held-out views, worst first, and their means."""
+    views = sorted(result.per_view, key=lambda score: score.psnr_db)
+    means = {name: mean(views, name) for name in ("psnr_db", "ssim", "hazy", "holes")}
+    return Table.of([*map(vars, views), {"name": "mean", **means}], _VIEWS)
 
 
 def write_cameras(path: Path, result: FitResult, images: PosedImages) -> None:
@@ -115,16 +152,6 @@ def write_cameras(path: Path, result: FitResult, images: PosedImages) -> None:
     files.write_json(path, {"frames": frames})
 
 
-def scores_table(result: FitResult) -> Table:
-    """Return the scores of the held-out views as a table for a terminal."""
-    table = Table("held-out view", "PSNR dB", "SSIM")
-    for score in sorted(result.per_view, key=lambda score: score.psnr_db):
-        table.add_row(score.name, f"{score.psnr_db:.2f}", f"{score.ssim:.4f}")
-    mean = f"{result.psnr_heldout_db:.2f}", f"{result.ssim_heldout:.4f}"
-    table.add_row("mean", *mean, style="bold")
-    return table
-
-
 def summary(result: FitResult) -> dict[str, Any]:
     """Return the scores of a fit as JSON has them; infinite PSNR becomes null."""
     document = {
@@ -132,15 +159,12 @@ def summary(result: FitResult) -> dict[str, Any]:
         "ssim_heldout": result.ssim_heldout,
         "wall_s": result.wall_s,
         "steps": result.steps,
-        "per_view": [view_entry(score) for score in result.per_view],
+        "per_view": [
+            score.entry("index name psnr_db ssim hazy holes")
+            for score in result.per_view
+        ],
     }
     return finite(document)
-
-
-def view_entry(score: ViewScore) -> dict[str, Any]:
-    """Return the score of one view without its pictures."""
-    names = ("index", "name", "psnr_db", "ssim", "hazy", "holes")
-    return {name: getattr(score, name) for name in names}
 
 
 def judge_fit(result: FitResult) -> list[Criterion]:
@@ -160,32 +184,17 @@ def _fitted_db(history: Sequence[FitProgress]) -> float | None:
     return pooled_db(late)
 
 
-def _pair(score: ViewScore, images: PosedImages, depth: np.ndarray | None) -> ViewPair:
-    rendering = score.rendering
-    assert rendering is not None
-    title = f"{score.name}: {score.psnr_db:.2f} dB, SSIM {score.ssim:.3f}"
-    known = None if depth is None else depth[score.index]
-    return ViewPair(
-        title,
-        reference(images, score.index),
-        rendering.image,
-        rendering.opacity,
-        rendering.depth,
-        known,
-    )
-
-
-def _depth_error(views: Sequence[ViewPair]) -> float | None:
+def _depth_error(views: Sequence[ViewScore]) -> float | None:
     """Return the median error over rays that both stop; None if there are none."""
-    errors = []
-    for view in views:
-        if view.known_depth is not None:
-            solid = np.where(view.opacity >= SOLID, view.depth, np.inf)
-            error = abs_difference(solid, view.known_depth)
-            errors.append(error[np.isfinite(error)])
-    if not any(error.size for error in errors):
+    errors = [
+        abs_difference(view.pictures.shown.solid_depth, view.pictures.depth)
+        for view in views
+        if view.pictures is not None and view.pictures.depth is not None
+    ]
+    known = [error[np.isfinite(error)] for error in errors]
+    if not any(error.size for error in known):
         return None
-    return float(np.median(np.concatenate(errors)))
+    return float(np.median(np.concatenate(known)))
 
 
 def _facts(
@@ -221,19 +230,3 @@ def _unit(result: FitResult) -> str:
 def _duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes} min {rest} s" if minutes else f"{seconds:.1f} s"
-
-
-def _entry(item: Criterion) -> dict[str, Any]:
-    names = ("name", "value", "limit", "at_least", "met")
-    return {name: getattr(item, name) for name in names}
-
-
-def finite(value: Any) -> Any:
-    """Replace infinite and undefined numbers, which JSON has not, by null."""
-    if isinstance(value, Mapping):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [finite(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -6,11 +6,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
+
+from mi_nerfattack.evaluation.metrics import cells
 from mi_nerfattack.io import files
-from mi_nerfattack.report.pages.elements import render
-from mi_nerfattack.report.plots.policy import plot_errors
-from mi_nerfattack.rollout.drive import Drive
-from mi_nerfattack.system.cores import machine
+from mi_nerfattack.report.columns import Column, Table
+from mi_nerfattack.report.pages.sections import Block, Picture, code, markdown
+from mi_nerfattack.report.plots.drives import NamedDrives, errors
+from mi_nerfattack.system.machine import machine
 from mi_nerfattack.training.record import TrainingRecord
 from mi_nerfattack.training.validation import ERROR, Epoch
 
@@ -27,8 +30,47 @@ _SHOWN = {
     "machine": "machine",
 }
 
-#: Drives by environment, route and case.
-Drives = Mapping[tuple[str, str, str], Sequence[Drive]]
+_CARD = (
+    Column("environment", "{environment}"),
+    Column("route", "{route}"),
+    Column("case", "{case}"),
+    Column("drives", "{n}"),
+    Column("mean (m)", "{cross_track_mean_m:.3f}"),
+    Column("95 %", "{cross_track_mean_ci95_m:.3f}"),
+    Column("largest (m)", "{cross_track_max_m:.2f}"),
+    Column("drives departed", "{drives_departed}"),
+    Column("95 %", "{departure_rate_ci95:.0%} %"),
+    Column("expert, mean (m)", "{expert_m:.3f}"),
+)
+_DRIVES = (
+    *_CARD[:3],
+    Column("run", "{run}"),
+    Column("seed", "{seed}"),
+    Column("mean (m)", "{cross_track_mean_m:.3f}"),
+    Column("largest (m)", "{cross_track_max_m:.2f}"),
+    Column("there, x and y (m)", "{worst_at_m[0]:.1f}, {worst_at_m[1]:.1f}"),
+    Column("at (s)", "{worst_time_s:.1f}"),
+    Column("left at (s)", "{departed_time_s:.1f}"),
+)
+_ROUNDS = (
+    Column("round", "{round}"),
+    Column("epochs", "{epochs}"),
+    Column("least held-out loss", lambda row: _recorded(row["held_out_loss"])),
+    Column(
+        "least closed-loop error (m)", lambda row: _recorded(row["closed_loop_error_m"])
+    ),
+)
+_ERRORS = (
+    "Distance from the lane centre: mean over all steps of all drives, with a "
+    "bootstrap interval over drives, and the largest of any step. A drive has departed "
+    "when its distance exceeds half the lane less half the car ({}); the share of such "
+    "drives has a Wilson interval. The expert knows its position and drives from the "
+    "same starts."
+)
+_NOT_MEASURED = (
+    "Times of day driven in: {}; exposures: {}. Nothing is known of all others, of "
+    "other routes and of other objects than those below."
+)
 
 
 def write_policy_page(
@@ -36,7 +78,7 @@ def write_policy_page(
     about: Mapping[str, Any],
     record: TrainingRecord | None,
     card: Mapping[str, Any],
-    drives: Drives,
+    drives: NamedDrives,
 ) -> Path:
     """Write `NAME.md`, `NAME.card.json` and `NAME.png`.
 
@@ -60,7 +102,7 @@ def write_policy_page(
         "training": None if record is None else training_facts(record),
     }
     files.write_json(folder / f"{name}.card.json", document)
-    plot_errors(folder / f"{name}.png", drives, _limits(card))
+    errors(folder / f"{name}.png", drives, _limits(card), signed=True)
     path = folder / f"{name}.md"
     files.write_text(path, page_text(name, document))
     return path
@@ -80,35 +122,63 @@ def page_text(name: str, document: Mapping[str, Any]) -> str:
         name: of the policy.
         document: content of the JSON beside it.
     """
-    cells = list(_cells(document["environments"]))
-    runs = [(*keys, run) for *keys, figures in cells for run in figures["per_run"]]
-    stayed = [item for item in runs if not item[-1]["departed"]]
-    under, training = document["environments_under"].values(), document["training"]
+    rows = list(_cells(document["environments"]))
+    runs = [{**cell, **run} for cell in rows for run in cell["per_run"]]
+    departed = [run for run in runs if run["departed"]]
+    stayed = [run for run in runs if not run["departed"]]
+    stayed.sort(key=lambda run: -run["cross_track_max_m"])
+    limits = _limits(document["environments"]).items()
+    under = document["environments_under"].values()
     exposures = sorted({item["exposure_ev"] for item in under})
-    return render(
-        "policy.md.j2",
-        name=name,
-        summary=summary(document["environments"]),
-        cells=cells,
-        limits=_limits(document["environments"]),
-        departed=[item for item in runs if item[-1]["departed"]],
-        stayed=sorted(stayed, key=lambda item: -item[-1]["cross_track_max_m"]),
-        skies=sorted({item["sky"] for item in under}),
-        stops=[f"{value:+g} EV" if value else "0 EV" for value in exposures],
-        training=training,
-        training_rows=[] if training is None else _training_rows(training),
-        command=document["command"],
-        measuring_rows=_measuring_rows(document),
-        NOT_RECORDED=NOT_RECORDED,
-    )
+    sections = {
+        "Errors in the closed loop": [
+            Table.of(rows, _CARD),
+            _ERRORS.format(", ".join(f"{route} {m:.2f} m" for route, m in limits)),
+            Picture("Distance from the lane centre over time", Path(f"{name}.png")),
+        ],
+        "Failures": [
+            f"Drives that left the lane: {len(departed)} of {len(runs)}.",
+            *([Table.of(departed, _DRIVES)] if departed else []),
+            "The largest errors of drives that did not:",
+            Table.of(stayed[:5], _DRIVES),
+        ],
+        "Not measured": [
+            _NOT_MEASURED.format(
+                ", ".join(sorted({item["sky"] for item in under})),
+                ", ".join(f"{ev:+g} EV" if ev else "0 EV" for ev in exposures),
+            )
+        ],
+        "Training": _training(document["training"]),
+        "How it was measured": [
+            {"command": code(document["command"]), **_measuring(document)}
+        ],
+    }
+    lead = summary(document["environments"])
+    return markdown(Markup("Policy ") + code(name), lead, sections)
+
+
+def _training(facts: Mapping[str, Any] | None) -> list[Block]:
+    """Return what a training was given, and what its rounds came to."""
+    if facts is None:
+        return [
+            f"There is no record of the training beside the policy: {NOT_RECORDED}."
+        ]
+    shown = {label: facts[name] for name, label in _SHOWN.items()}
+    shown |= {k: v for k, v in facts["settings"].items() if k not in shown}
+    rounds = [{"round": i, **row} for i, row in enumerate(facts["rounds"])]
+    return [_flat(shown), Table.of(rounds, _ROUNDS)]
+
+
+def _recorded(value: float | None) -> str:
+    return NOT_RECORDED if value is None else f"{value:.4f}"
 
 
 def summary(card: Mapping[str, Any]) -> str:
     """Say in a sentence how many drives left their lane, and the errors."""
-    cells = [figures for *_, figures in _cells(card)]
-    total = sum(figures["n"] for figures in cells)
-    left = sum(figures["drives_departed"] for figures in cells)
-    means = [figures["cross_track_mean_m"] for figures in cells]
+    rows = list(_cells(card))
+    total = sum(row["n"] for row in rows)
+    left = sum(row["drives_departed"] for row in rows)
+    means = [row["cross_track_mean_m"] for row in rows]
     return (
         f"{left} of {total} drives left the lane; mean distance from the lane centre "
         f"{min(means):.3f} to {max(means):.3f} m by environment, route and case."
@@ -122,7 +192,6 @@ def training_facts(record: TrainingRecord) -> dict[str, Any]:
 
 
 def _round(rows: Sequence[Epoch]) -> dict[str, Any]:
-    """Summarise the epochs of one training."""
     errors = [row[ERROR] for row in rows if ERROR in row]
     return {
         "epochs": len(rows),
@@ -131,14 +200,7 @@ def _round(rows: Sequence[Epoch]) -> dict[str, Any]:
     }
 
 
-def _training_rows(facts: Mapping[str, Any]) -> list[list[str]]:
-    """Return names and values of what a training was given."""
-    shown = {label: facts[name] for name, label in _SHOWN.items()}
-    shown |= {k: v for k, v in facts["settings"].items() if k not in shown}
-    return [row for name, value in shown.items() for row in _flat(name, value)]
-
-
-def _measuring_rows(document: Mapping[str, Any]) -> list[list[str]]:
+def _measuring(document: Mapping[str, Any]) -> dict[str, str]:
     """Return names and values of how a policy was measured."""
     seconds = document.get("seconds_a_drive") or {}
     shown = {
@@ -153,27 +215,30 @@ def _measuring_rows(document: Mapping[str, Any]) -> list[list[str]]:
         "settings": document["settings"],
         "version": document["versions"],
     }
-    return [row for name, value in shown.items() for row in _flat(name, value)]
+    return _flat(shown)
 
 
-def _cells(card: Mapping[str, Any]) -> Iterator[tuple[str, str, str, Any]]:
-    for environment, routes in card.items():
-        for route, cases in routes.items():
-            for case, figures in cases.items():
-                yield environment, route, case, figures
+def _cells(card: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield the figures of each cell of a card with its names."""
+    for cell in cells(card, "environment", "route", "case"):
+        expert = cell.get("expert", {}).get("cross_track_mean_m")
+        yield {**cell, "expert_m": expert}
 
 
 def _limits(card: Mapping[str, Any]) -> dict[str, float]:
-    return {r: figures["departure_limit_m"] for _, r, _, figures in _cells(card)}
+    return {cell["route"]: cell["departure_limit_m"] for cell in _cells(card)}
 
 
-def _flat(name: str, value: Any) -> list[list[str]]:
-    """Return rows for a value and what it holds."""
-    if isinstance(value, dict):
-        return [row for key in value for row in _flat(f"{name}: {key}", value[key])]
-    if value is None:
-        return [[name, NOT_RECORDED]]
-    if not isinstance(value, list | tuple):
-        return [[name, str(value)]]
-    texts = (str(list(v) if isinstance(v, tuple) else v) for v in value)
-    return [[name, ", ".join(texts)]]
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """Return values, and what those of them hold, as text by name."""
+    result = {}
+    for key, value in values.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, dict):
+            result |= _flat(value, f"{name}: ")
+        elif isinstance(value, list | tuple):
+            texts = (str(list(v) if isinstance(v, tuple) else v) for v in value)
+            result[name] = ", ".join(texts)
+        else:
+            result[name] = NOT_RECORDED if value is None else str(value)
+    return result

@@ -10,12 +10,12 @@ import matplotlib
 from matplotlib.colors import to_hex
 
 from mi_nerfattack.io import files
-from mi_nerfattack.report.pages.elements import render
-from mi_nerfattack.report.pages.parts import Parts, RunPart
-from mi_nerfattack.report.plots.transfer import COLOURS, LIGHT, matrix_lines
-from mi_nerfattack.rollout.drive import ATTACK, RANDOM
+from mi_nerfattack.report import table
+from mi_nerfattack.report.columns import Cell, Column, Table
+from mi_nerfattack.report.pages.elements import Parts, RunPart, TransferPart, render
+from mi_nerfattack.report.plots.transfer import COLOURS, LIGHT, Line, matrix_lines
 
-_COST_LABELS = {
+_COST_LABELS: Mapping[str, str] = {
     "wall_s": "wall time (s)",
     "peak_memory_mb": "peak memory (MB)",
     "renders": "frames rendered",
@@ -35,95 +35,91 @@ def write_results_page(path: str | Path, title: str, parts: Parts) -> None:
         parts: what it shows.
     """
     shown = parts.shown
+    cost: list[dict[str, Any]] = [
+        {
+            _COST_LABELS.get(key, key): value
+            for key, value in run.document["cost"].items()
+        }
+        for run in shown
+    ]
     text = render(
         "results.html.j2",
         title=title,
         parts=parts,
         shown=shown,
-        headline=[row for run in parts.runs for row in _headline(run)],
-        matrices=[_matrix(part.document) for part in parts.transfers],
-        cost=_beside([run.document["cost"] for run in shown], _COST_LABELS),
-        made_with=_beside([run.made_with for run in shown]),
-        digests=_beside([run.digests for run in shown]),
+        tables=table,
+        matrix=_matrix,
+        commands=_commands(shown),
+        cost=_beside(shown, cost, "What the runs cost, over all their processes."),
+        made_with=_beside(
+            shown,
+            [run.made_with for run in shown],
+            "Versions that the runs were made with.",
+        ),
+        digests=_beside(
+            shown,
+            [run.digests for run in shown],
+            "Of the files that the scenarios name.",
+        ),
     )
     files.write_text(path, text)
 
 
-def _headline(run: RunPart) -> list[dict[str, Any]]:
-    """Return a row for each route and environment."""
-    return [
-        {
-            "run": run.label,
-            "route": route,
-            "environment": environment,
-            "cases": cases,
-            "ratio": _ratio(cases),
-        }
-        for route, environments in run.document["routes"].items()
-        for environment, cases in environments.items()
-    ]
-
-
-def _ratio(cases: Mapping[str, Any]) -> float | None:
-    """Return the attack's mean error as a multiple of that past random looks."""
-    attack, chance = cases.get(ATTACK), cases.get(RANDOM)
-    if attack is None or chance is None or not chance["cross_track_mean_m"]:
-        return None
-    return attack["cross_track_mean_m"] / chance["cross_track_mean_m"]
-
-
-def _matrix(document: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the blocks of a transfer's matrix, one an environment.
-
-    Returns:
-        ``environment`` and ``lines``, each a label and, by condition, None where
-        nothing was driven, or text, colour of the cell and colour of the text.
-    """
+def _matrix(part: TransferPart) -> Table:
+    """Return a transfer's matrix: a line for each environment and case or attack."""
+    document = part.document
     names = dict.fromkeys(column["environment"] for column in document["columns"])
-    blocks = {name: matrix_lines(document, name) for name in names}
-    values = [
-        value
-        for lines in blocks.values()
-        for line in lines
-        for value, _ in line.cells.values()
-    ]
+    lines = [(name, line) for name in names for line in matrix_lines(document, name)]
+    values = [value for _, line in lines for value, _ in line.cells.values()]
     most, colours = max([*values, 1e-9]), matplotlib.colormaps[COLOURS]
 
-    def cell(value: float, text: str) -> tuple[str, str, str]:
+    def cell(line: Line, condition: str) -> Cell:
+        if condition not in line.cells:
+            return Cell("")
+        value, told = line.cells[condition]
+        text, _, out = told.partition("\n")
         share = value / most
-        return text, to_hex(colours(share)), "#000" if share > LIGHT else "#fff"
+        colour = "#000" if share > LIGHT else "#fff"
+        style = f"background: {to_hex(colours(share))}; color: {colour}"
+        return Cell(text, out, style=style)
 
-    return [
-        {
-            "environment": name,
-            "lines": [
-                (
-                    line.label.strip(),
-                    [
-                        cell(*line.cells[condition])
-                        if condition in line.cells
-                        else None
-                        for condition in document["conditions"]
-                    ],
-                )
-                for line in lines
-            ],
-        }
-        for name, lines in blocks.items()
+    caption = (
+        f"{part.label}: {len(document['attacks'])} attacks, unchanged, from "
+        f"{document['starts']} unseen starts each. Mean distance from the lane centre "
+        "(m), the darker the nearer; below that of attacks, how many have a wheel out "
+        f"for {document['success_s']:g} s. Light has no effect on a field: nothing was "
+        "driven there."
+    )
+    labels = [
+        Column("environment", lambda row: row[0]),
+        Column("case", lambda row: row[1].label.strip()),
     ]
+    figures = [
+        Column(name.replace(",", ", "), lambda row, name=name: cell(row[1], name))
+        for name in document["conditions"]
+    ]
+    return Table("", labels, figures, lines, caption=caption)
+
+
+def _commands(runs: Sequence[RunPart]) -> Table:
+    figures = [
+        Column("seed", lambda run: run.document["seed"]),
+        Column("command", lambda run: Cell(run.repeat, code=True)),
+    ]
+    caption = "What makes each run again; RUN is a new folder."
+    labels = [Column("run", lambda run: run.label)]
+    return Table("", labels, figures, runs, caption=caption)
 
 
 def _beside(
-    columns: Sequence[Mapping[str, Any]], names: Mapping[str, str] | None = None
-) -> dict[str, list[Any]]:
-    """Lay facts of runs beside each other: by name, a value a run, None if unknown.
+    runs: Sequence[RunPart], columns: Sequence[Mapping[str, Any]], caption: str
+) -> Table:
+    """Lay facts of runs beside each other: a row for each fact, a column for a run."""
 
-    Args:
-        columns: facts of each run by key.
-        names: of the keys on the page.
-    """
-    keys = dict.fromkeys(key for column in columns for key in column)
-    return {
-        (names or {}).get(key, key): [column.get(key) for column in columns]
-        for key in keys
-    }
+    def fact(index: int) -> Column:
+        header = runs[index].label if len(runs) > 1 else ""
+        return Column(header, lambda name: columns[index].get(name), digits=1)
+
+    names = list(dict.fromkeys(name for column in columns for name in column))
+    figures = [fact(index) for index in range(len(runs))]
+    return Table("", [Column("", str)], figures, names, caption=caption)

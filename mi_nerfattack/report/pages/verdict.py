@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mi_nerfattack.fit.scores import HAZY, SOLID, ViewScore
+from mi_nerfattack.fit.scores import HAZY, SOLID, ViewScore, least, mean
 
 MIN_PSNR_DB = 24.0  # mean over held-out views
 MIN_WORST_DB = 18.0  # of any held-out view
@@ -121,36 +121,28 @@ def judge(
         fitted_db: PSNR of the rays fitted to, at the end of the fit; None if unknown.
         subject: what the field stands for.
     """
-    psnr = [score.psnr_db for score in scores]
-    hazy = f"share of rays with an opacity from {HAZY[0]:g} to {HAZY[1]:g}"
-    rows: list[tuple[str, float, float, bool, str]] = [
-        ("held-out views", len(scores), MIN_VIEWS, True, subject.few),
-        (
-            "mean PSNR of held-out views (dB)",
-            float(np.mean(psnr)),
-            MIN_PSNR_DB,
-            True,
-            subject.blurred,
-        ),
-        (
-            "PSNR of the worst held-out view (dB)",
-            float(min(psnr)),
-            MIN_WORST_DB,
-            True,
-            subject.worst,
-        ),
-        (hazy, float(np.mean([s.hazy for s in scores])), MAX_HAZY, False, subject.fog),
-    ]
-    holes = [score.holes for score in scores if not np.isnan(score.holes)]
-    if holes:
+    found: list[Criterion] = []
+
+    def add(name: str, value: float, limit: float, at_least: bool, advice: str) -> None:
+        found.append(Criterion(name, value, limit, at_least, advice, subject))
+
+    psnr, worst = mean(scores, "psnr_db"), least(scores, "psnr_db")
+    add("held-out views", len(scores), MIN_VIEWS, True, subject.few)
+    name = "mean PSNR of held-out views (dB)"
+    add(name, psnr, MIN_PSNR_DB, True, subject.blurred)
+    name = "PSNR of the worst held-out view (dB)"
+    add(name, worst, MIN_WORST_DB, True, subject.worst)
+    name = f"share of rays with an opacity from {HAZY[0]:g} to {HAZY[1]:g}"
+    add(name, mean(scores, "hazy"), MAX_HAZY, False, subject.fog)
+    if not np.isnan(holes := mean(scores, "holes")):
         name = f"share of known surfaces with an opacity below {SOLID:g}"
-        rows.append((name, float(np.mean(holes)), MAX_HOLES, False, subject.holes))
+        add(name, holes, MAX_HOLES, False, subject.holes)
     if fitted_db is not None:
-        pooled = pooled_db(psnr)
+        pooled = pooled_db([score.psnr_db for score in scores])
         gap = 0.0 if pooled == fitted_db else fitted_db - pooled  # both may be infinite
         name = "PSNR of fitted rays less that of held-out ones (dB)"
-        rows.append((name, gap, MAX_GAP_DB, False, subject.learnt))
-    return [Criterion(*row, subject) for row in rows]
+        add(name, gap, MAX_GAP_DB, False, subject.learnt)
+    return found
 
 
 def verdict(criteria: Sequence[Criterion]) -> str:

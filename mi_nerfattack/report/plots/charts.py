@@ -24,6 +24,7 @@ PALETTE = BLUE, ORANGE, GREEN, PINK, YELLOW, SKY
 RC: Any = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
+    "axes.titlelocation": "left",
     "axes.spines.top": False,
     "axes.spines.right": False,
     "savefig.facecolor": "white",

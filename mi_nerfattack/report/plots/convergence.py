@@ -47,7 +47,7 @@ def convergence(
             axis.set_ylabel(label)
             axis.grid(alpha=0.25)
             axis.xaxis.get_major_locator().set_params(integer=True)
-        figure.axes[0].set_title(f"Attack of {count} iterations", loc="left")
+        figure.axes[0].set_title(f"Attack of {count} iterations")
         figure.axes[0].legend(frameon=False)
         words = "iteration" if curve is None else "frames rendered, or their cost"
         figure.axes[-1].set_xlabel(words)
@@ -70,17 +70,18 @@ def damage(path: str | Path, methods: Mapping[str, Curves]) -> None:
             color = PALETTE[number % len(PALETTE)]
             style = _DASHES[number // len(PALETTE) % len(_DASHES)]
             _draw(axis, curves, f"{method} ({len(curves)})", color, style)
-        axis.set_ylim(bottom=0)
-        axis.set_xlim(left=0)
-        axis.set_xlabel("frames rendered, or their cost")
-        axis.set_ylabel("mean distance from\nthe lane centre (m)")
-        axis.set_title(
-            "best so far in the surrogate; median and range of so many attacks",
-            loc="left",
-            fontsize=9,
-        )
-        axis.grid(alpha=0.25)
+        title = "best so far in the surrogate; median and range of so many attacks"
+        _label(axis, title, "frames rendered, or their cost")
         figure.legend(loc="outside lower center", ncols=4, frameon=False)
+
+
+def _label(axis: Axes, title: str, across: str) -> None:
+    axis.set_ylim(bottom=0)
+    axis.set_xlim(left=0)
+    axis.set_xlabel(across)
+    axis.set_ylabel("mean distance from\nthe lane centre (m)")
+    axis.set_title(title, fontsize=9)
+    axis.grid(alpha=0.25)
 
 
 def _draw(axis: Axes, curves: Curves, label: str, color: str, style: str) -> None:
@@ -128,10 +129,5 @@ def against_limit(
             axis.errorbar(
                 at, middle, bars, capsize=3, label=name, color=color, marker="o"
             )
-        axis.set_ylim(bottom=0)
-        axis.set_xlim(left=0)
-        axis.set_xlabel(limit)
-        axis.set_ylabel("mean distance from\nthe lane centre (m)")
-        axis.set_title("median and range of attacks", loc="left", fontsize=9)
-        axis.grid(alpha=0.25)
+        _label(axis, "median and range of attacks", limit)
         figure.legend(loc="outside lower center", ncols=4, frameon=False)

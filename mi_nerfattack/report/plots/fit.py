@@ -46,7 +46,7 @@ def write_curve(
             axes[1].xaxis.set_major_locator(MaxNLocator(6))
         if loss and min(loss) > 0:
             grid[0, 0].set_yscale("log")
-        grid[0, 0].set_title("Rays that are fitted to", loc="left")
+        grid[0, 0].set_title("Rays that are fitted to")
         grid[0, 0].set_ylabel("loss")
         grid[1, 0].set_ylabel("PSNR (dB)")
         grid[1, 0].set_xlabel("step")
@@ -86,7 +86,7 @@ def write_cameras_above(
         axes.set_xlabel("x")
         axes.set_ylabel("y")
         axes.legend(fontsize=8)
-        axes.set_title("Cameras from above", loc="left")
+        axes.set_title("Cameras from above")
 
 
 def write_histogram(path: str | Path, scores: Sequence[ViewScore]) -> None:
@@ -107,7 +107,7 @@ def write_histogram(path: str | Path, scores: Sequence[ViewScore]) -> None:
             axis.axvline(float(np.mean(values)), color=ORANGE, linestyle="--")
             label = f"mean {np.mean(values):.2f} dB"
             axis.set_title(label, loc="right", fontsize=8, color=ORANGE)
-        axis.set_title("Held-out views", loc="left")
+        axis.set_title("Held-out views")
         axis.set_xlabel("PSNR (dB)")
         axis.set_ylabel("views")
         axis.yaxis.set_major_locator(MaxNLocator(5, integer=True))

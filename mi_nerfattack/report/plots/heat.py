@@ -17,8 +17,8 @@ from matplotlib.colors import Normalize
 
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.grid import GridField
-from mi_nerfattack.report.plots.around import PAPER, Around, over_paper
 from mi_nerfattack.report.plots.charts import DPI, WIDTH_PX, chart
+from mi_nerfattack.report.plots.strip import PAPER, Around, over_paper
 
 #: Sides of the object, by the compass of its own frame: degrees about z from +x.
 SIDES = {"from +x": 0.0, "from +y": 90.0, "from -x": 180.0, "from -y": 270.0}
@@ -163,7 +163,7 @@ def write_heat(
     with chart(path, _height_in(objects)) as figure:
         axes = figure.subplots(rows, len(SIDES), squeeze=False)
         for i, (name, views) in enumerate(objects.items()):
-            axes[2 * i, 0].set_title(name, fontsize=9, loc="left")
+            axes[2 * i, 0].set_title(name, fontsize=9)
             for column, view in enumerate(views):
                 _show(axes[2 * i, column], view.colour)
                 _show(axes[2 * i + 1, column], _coloured(view, norm))

@@ -9,6 +9,7 @@ import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,6 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Polygon
 
 from mi_nerfattack.deploy.views.above import scene_above, surrogate_above
 from mi_nerfattack.deploy.views.mitsuba import MitsubaView
@@ -25,16 +24,21 @@ from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_ma
 from mi_nerfattack.render.camera.outside import Overhead, seen_at
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.report.plots.charts import DPI, RC, save
+from mi_nerfattack.report.plots.map import (
+    OBJECT,
+    draw_lane,
+    draw_objects,
+    frame_map,
+    lane_lines,
+)
 from mi_nerfattack.rollout.scene_sensor import SceneSensor
 from mi_nerfattack.vehicle.route.route import Route
 
 WIDTH_PX = 1600
-BORDER, CENTRE, START, END = "white", "#00E5FF", "#00C853", "#FF1744"
-OBJECT, CAMERA = "#FFEA00", "#FF6D00"
-_PARTS, _ARROWS = 240, 7  # of a route
+CENTRE, START, END, CAMERA = "#00E5FF", "#00C853", "#FF1744", "#FF6D00"
+_PARTS, _ARROWS = 240, 7  # of a drive's line
 _REAR, _FRONT = 0.5, 1.9  # of a car's middle rear axle, in widths
 _TOLD = {"REFUSED": "#B00020", "LOOK AT": "#9A5B00"}
-_EDGE: Any = {"color": "black", "alpha": 0.6}
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +68,7 @@ class Overlay:
 
     def overhead(self, longest_px: int) -> Overhead:
         """Frame all of it from above."""
-        points = [_along(route)[:, :2] for route in self.routes]
+        points = [lane_lines(route)[0] for route in self.routes]
         points += [self.starts[:, :2], *self.objects.values()]
         margin = max(1.5 * route.lane_width_m for route in self.routes)
         return Overhead.covering(np.concatenate(points), margin, longest_px)
@@ -109,7 +113,11 @@ def place_picture(
     looks = looks or {}
     left, right, bottom, top = overhead.extent
     width_in = WIDTH_PX / DPI
-    lines = [(line, text) for text in told for line in _wrapped(text)]
+    lines = [
+        (line, text)
+        for text in told
+        for line in textwrap.wrap(text, 150, subsequent_indent="    ")
+    ]
     aspect = (top - bottom) / (right - left)
     map_in = min((width_in / len(grounds) - 0.6) * aspect, 7.0) + 0.85
     view_in, shapes = 0.0, []
@@ -126,9 +134,7 @@ def place_picture(
         for k, (name, image) in enumerate(grounds.items()):
             axis = rows[0, 0].add_subplot(1, len(grounds), k + 1)
             _draw_ground(axis, overlay, overhead, name, image)
-        handles = _handles(overlay)
-        style = {"ncols": 5, "frameon": False, "columnspacing": 1.2}
-        rows[1, 0].legend(handles=handles, loc="center", fontsize=8, **style)
+        _draw_legend(rows[1, 0], rows[0, 0].axes[0])
         if looks:
             axes = rows[2, 0].subplots(
                 1, len(looks), width_ratios=shapes, squeeze=False
@@ -182,6 +188,14 @@ def routes_picture(
     place_picture(path, overlay, overhead, grounds, looks, title=title)
 
 
+def _draw_legend(figure: Any, axis: Any) -> None:
+    """Name each kind of thing that a map shows once."""
+    labels = dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
+    style = {"ncols": 5, "frameon": False, "columnspacing": 1.2}
+    names = labels.values(), labels.keys()
+    figure.legend(*names, loc="center", fontsize=8, **style)
+
+
 def _draw_ground(
     axis: Axes, overlay: Overlay, overhead: Overhead, name: str, image: np.ndarray
 ) -> None:
@@ -189,31 +203,24 @@ def _draw_ground(
     axis.imshow(image, extent=(left, right, bottom, top), interpolation="bilinear")
     for route in overlay.routes:
         _draw_route(axis, route, overlay)
-    for k, path in enumerate(overlay.paths.values()):
-        axis.plot(*path.T, color=_PATHS[k % len(_PATHS)], linewidth=1.1, zorder=5)
+    for (title, path), color in zip(overlay.paths.items(), cycle(_PATHS), strict=False):
+        axis.plot(*path.T, color=color, linewidth=1.1, zorder=5, label=title)
     if overlay.camera is not None and len(overlay.starts):
         reach = 0.25 * max(right - left, top - bottom)
         corners = _frustum(overlay.starts[0], overlay.camera, reach)
-        axis.add_patch(
-            Polygon(corners, facecolor=CAMERA, edgecolor=CAMERA, alpha=0.22, zorder=4)
-        )
+        style: dict[str, Any] = {"facecolor": CAMERA, "alpha": 0.22, "zorder": 4}
+        axis.fill(*corners.T, label="what the camera sees", **style)
     for state in overlay.starts[::-1]:
         corners = car_outline(state, overlay.car_width_m)
-        axis.add_patch(Polygon(corners, fill=False, edgecolor=START, zorder=6))
+        style = {"fill": False, "edgecolor": START, "zorder": 6}
+        axis.fill(*corners.T, label="cars at the starts", **style)
+    draw_objects(axis, list(overlay.objects.values()), on_ground=True)
     for label, outline in overlay.objects.items():
-        axis.fill(*outline.T, fill=False, edgecolor=OBJECT, linewidth=2, zorder=7)
         x, y = outline.mean(0).tolist()
         axis.annotate(
             label, (x, y), (8, 8), textcoords="offset points", **_note(OBJECT)
         )
-    axis.set_xlim(left, right)
-    axis.set_ylim(bottom, top)
-    axis.set_aspect("equal")
-    axis.set_title(name, loc="left")
-    axis.set_xlabel("x (m)")
-    axis.set_ylabel("y (m)")
-    for side in ("top", "right"):
-        axis.spines[side].set_visible(False)
+    frame_map(axis, name, overhead.extent)
 
 
 def _note(colour: str) -> dict[str, Any]:
@@ -222,23 +229,21 @@ def _note(colour: str) -> dict[str, Any]:
 
 
 def _draw_route(axis: Axes, route: Route, overlay: Overlay) -> None:
-    along = _along(route)
-    for side in (-0.5, 0.5):
-        border = _beside(along, side * route.lane_width_m)
-        axis.plot(*border.T, **{**_EDGE, "linewidth": 2.2})
-        axis.plot(*border.T, color=BORDER, linewidth=1.0, linestyle=(0, (4, 2)))
-    axis.plot(*along[:, :2].T, color=CENTRE, linewidth=1.0, linestyle=":")
+    draw_lane(axis, route, on_ground=True)
+    axis.plot(*lane_lines(route)[0].T, color=CENTRE, linewidth=1.0, linestyle=":")
     begin, end = overlay.driven or (0.0, route.length)
     arc = np.linspace(begin, end, _PARTS)
     line = route.pose_at(arc)
-    axis.plot(*line[:, :2].T, color=CENTRE, linewidth=1.8, zorder=3)
+    whole = "route, in the direction of travel"
+    axis.plot(*line[:, :2].T, color=CENTRE, linewidth=1.8, zorder=3, label=whole)
     for s in np.linspace(begin, end, _ARROWS + 2)[1:-1]:
         tail, head = route.pose_at(np.array([s - 0.01 * (end - begin), s]))[:, :2]
         style = {"arrowstyle": "-|>", "color": CENTRE, "mutation_scale": 14}
         axis.annotate("", head, tail, arrowprops=style, zorder=6)
-    axis.plot(*line[0, :2], "o", color=START, markeredgecolor="black", zorder=8)
+    style = {"markeredgecolor": "black", "zorder": 8}
+    axis.plot(*line[0, :2], "o", color=START, label="start", **style)
     if not route.closed or overlay.driven:
-        axis.plot(*line[-1, :2], "s", color=END, markeredgecolor="black", zorder=8)
+        axis.plot(*line[-1, :2], "s", color=END, label="end", **style)
     if overlay.driven is None:
         at = (6, 6)
         x, y, _ = line[-1].tolist()
@@ -257,11 +262,10 @@ def _draw_look(axis: Axes, overlay: Overlay, name: str, look: Look) -> None:
 
     if look.from_behind:
         for route in overlay.routes:
-            along = _along(route)
-            draw(_raised(along[:, :2]), color=CENTRE, linewidth=1.2)
-            for side in (-0.5, 0.5):
-                border = _raised(_beside(along, side * route.lane_width_m))
-                draw(border, color=BORDER, linewidth=1.0, linestyle=(0, (4, 2)))
+            centre, *borders = map(_raised, lane_lines(route))
+            draw(centre, color=CENTRE, linewidth=1.2)
+            for border in borders:
+                draw(border, color="white", linewidth=1.0, linestyle=(0, (4, 2)))
         for ring in _car_box(overlay.starts[0], overlay.car_width_m):
             draw(ring, color=START, linewidth=1.5)
     for k, (label, top) in enumerate(overlay.tops.items()):
@@ -274,45 +278,12 @@ def _draw_look(axis: Axes, overlay: Overlay, name: str, look: Look) -> None:
             )
     axis.set_xlim(0, width)
     axis.set_ylim(height, 0)
-    axis.set_title(name, loc="left")
+    axis.set_title(name)
     axis.set_anchor("N")
     axis.set_axis_off()
 
 
 _PATHS = ("#2979FF", "#D500F9", "#76FF03", "#FF9100")
-
-
-def _handles(overlay: Overlay) -> list[Any]:
-    def line(label: str, colour: str, **style: Any) -> Line2D:
-        return Line2D([], [], label=label, color=colour, **style)
-
-    dot = {"linestyle": "none", "markeredgecolor": "black"}
-    whole = "route, in the direction of travel"
-    handles: list[Any] = [
-        line(whole, CENTRE, linewidth=2, marker=">"),
-        line("lane borders", "#8a8a8a", linestyle=(0, (4, 2))),
-        line("start", START, marker="o", **dot),
-        line("end", END, marker="s", **dot),
-    ]
-    if overlay.objects:
-        handles.append(Patch(fill=False, edgecolor="#c9b800", label="object's box"))
-    if len(overlay.starts):
-        handles.append(Patch(fill=False, edgecolor=START, label="cars at the starts"))
-    if overlay.camera is not None:
-        handles.append(Patch(facecolor=CAMERA, alpha=0.4, label="what the camera sees"))
-    for k, name in enumerate(overlay.paths):
-        handles.append(line(name, _PATHS[k % len(_PATHS)], linewidth=2))
-    return handles
-
-
-def _along(route: Route) -> np.ndarray:
-    """Return poses (n, 3) along a whole route."""
-    return route.pose_at(np.linspace(0, route.length, _PARTS))
-
-
-def _beside(poses: np.ndarray, left_m: float) -> np.ndarray:
-    x, y, theta = poses.T
-    return np.stack([x - left_m * np.sin(theta), y + left_m * np.cos(theta)], axis=1)
 
 
 def _raised(points: np.ndarray, height_m: float = 0.02) -> np.ndarray:
@@ -341,7 +312,3 @@ def _car_box(state: np.ndarray, width_m: float) -> list[np.ndarray]:
     low, high = _raised(ring, 0.1 * width_m), _raised(ring, 0.8 * width_m)
     posts = [np.stack([a, b]) for a, b in zip(low[:4], high[:4], strict=True)]
     return [low, high, *posts]
-
-
-def _wrapped(text: str) -> list[str]:
-    return textwrap.wrap(text, 150, subsequent_indent="    ")

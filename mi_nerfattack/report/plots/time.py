@@ -85,11 +85,9 @@ def plot_attribution(
         _draw_costates(axes[0], data)
         _draw_shares(axes[1], data)
         _draw_errors(axes[2], data)
-        axes[0].set_title(
-            "When the failure is made: sensitivity to the state", loc="left"
-        )
-        axes[1].set_title(f"Share of each control period in the {subject}", loc="left")
-        axes[2].set_title("Distance from the lane centre", loc="left")
+        axes[0].set_title("When the failure is made: sensitivity to the state")
+        axes[1].set_title(f"Share of each control period in the {subject}")
+        axes[2].set_title("Distance from the lane centre")
         axes[2].set_xlabel("time (s)")
         for axis in axes:
             axis.grid(alpha=0.25)
@@ -110,7 +108,7 @@ def _draw_costates(axis: Axes, data: TimeAttribution) -> None:
 
 def _draw_shares(axis: Axes, data: TimeAttribution) -> None:
     """Draw stacked bars, those against the others below the axis."""
-    width = _period(data.time_s)
+    width = float(data.time_s[-1]) / len(data.time_s)
     shares = 100 * data.shares
     above, below = np.zeros(len(shares)), np.zeros(len(shares))
     for index, name in enumerate(data.objects):
@@ -180,7 +178,3 @@ def _legend_above(axis: Axes) -> None:
         ncols=4,
         borderpad=0.0,
     )
-
-
-def _period(time_s: np.ndarray) -> float:
-    return float(time_s[-1]) / len(time_s)

@@ -74,7 +74,6 @@ def plot_transfer(path: str | Path, document: Mapping[str, Any]) -> None:
             f"attacks: {len(document['attacks'])}, from {document['starts']} unseen "
             "starts each; below their error, how many have a wheel out for "
             f"{document['success_s']:g} s",
-            loc="left",
             fontsize=9,
         )
 
@@ -118,7 +117,7 @@ def plot_quality(path: str | Path, document: Mapping[str, Any]) -> None:
         errors.set_xlabel("PSNR of the surrogate on held-out views (dB)")
         for axis in (shares, errors):
             axis.grid(alpha=0.25)
-        shares.set_title(f"{condition}; attacks of each surrogate", loc="left")
+        shares.set_title(f"{condition}; attacks of each surrogate")
         handles = errors.get_legend_handles_labels()
         figure.legend(*handles, loc="outside lower center", ncols=4)
 

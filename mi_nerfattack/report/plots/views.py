@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 
 import matplotlib
@@ -13,53 +13,33 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from mi_nerfattack.fit.scores import SOLID
-from mi_nerfattack.report.plots.charts import DPI, WIDTH_PX, chart
+from mi_nerfattack.evaluation.field_and_scene import RouteComparison
+from mi_nerfattack.fit.scores import Pictures, ViewScore
+from mi_nerfattack.report.plots.charts import DPI, PALETTE, WIDTH_PX, chart
 
 _ERROR_MAX = 0.4  # of sRGB values, at the end of the scale
 _FAR = 0.98  # quantile of depths at the end of the scale
 _DEPTHS, _ERRORS, _NOTHING = "viridis_r", "inferno", "#c8c8c8"
 
 
-@dataclass(frozen=True, eq=False)
-class ViewPair:
-    """One view as it should be and as a field shows it.
-
-    Attributes:
-        title: one line.
-        wanted: (height, width, 3), sRGB in [0, 1].
-        shown: the field's, of the same shape.
-        opacity: (height, width), the field's.
-        depth: (height, width), metres along the ray, the field's.
-        known_depth: (height, width), infinite where there is nothing; None if unknown.
-    """
-
-    title: str
-    wanted: np.ndarray
-    shown: np.ndarray
-    opacity: np.ndarray
-    depth: np.ndarray
-    known_depth: np.ndarray | None = None
-
-
 def write_colours(
-    path: str | Path, views: Sequence[ViewPair], wanted: str, shown: str = "field"
+    path: str | Path, views: Sequence[ViewScore], wanted: str, shown: str = "field"
 ) -> None:
     """Write image, field and error of views below each other.
 
     Args:
         path: PNG file.
-        views: at least one, all of one size.
+        views: at least one, with their pictures, all of one size.
         wanted: title of the column of images.
         shown: of the field's.
     """
-    scale = Normalize(0, _ERROR_MAX)
-    with chart(path, _height(views, 3)) as figure:
+    scale, pictures = Normalize(0, _ERROR_MAX), _pictures(views)
+    with chart(path, _height(pictures, 3)) as figure:
         rows = _panels(figure, views, (wanted, shown, "difference"))
-        for view, axes in zip(views, rows, strict=True):
-            error = np.abs(view.shown - view.wanted).mean(axis=2)
-            axes[0].imshow(np.clip(view.wanted, 0, 1), interpolation="nearest")
-            axes[1].imshow(np.clip(view.shown, 0, 1), interpolation="nearest")
+        for pair, axes in zip(pictures, rows, strict=True):
+            error = np.abs(pair.shown.image - pair.wanted).mean(axis=2)
+            axes[0].imshow(np.clip(pair.wanted, 0, 1), interpolation="nearest")
+            axes[1].imshow(np.clip(pair.shown.image, 0, 1), interpolation="nearest")
             _map(axes[2], error, _ERRORS, scale)
         label = "difference of sRGB values (0 to 1), mean of the channels"
         _bar(figure, rows, _ERRORS, scale, label)
@@ -67,7 +47,7 @@ def write_colours(
 
 def write_depths(
     path: str | Path,
-    views: Sequence[ViewPair],
+    views: Sequence[ViewScore],
     unit: str = "m",
     titles: tuple[str, str] = ("field", "known"),
 ) -> None:
@@ -77,18 +57,19 @@ def write_depths(
 
     Args:
         path: PNG file.
-        views: at least one, all of one size.
+        views: at least one, with their pictures, all of one size.
         unit: of the depths, for the labels.
         titles: of the column of the field, and of that of what is known.
     """
-    known = all(view.known_depth is not None for view in views)
-    shown = [np.where(view.opacity >= SOLID, view.depth, np.inf) for view in views]
-    given = [view.known_depth for view in views if view.known_depth is not None]
+    pictures = _pictures(views)
+    shown = [pair.shown.solid_depth for pair in pictures]
+    given = [pair.depth for pair in pictures if pair.depth is not None]
+    known = len(given) == len(shown)
     scale = Normalize(*_range([*shown, *given]))
     columns = (*titles, "difference") if known else titles[:1]
     errors = [abs_difference(*pair) for pair in zip(shown, given, strict=False)]
     error_scale = Normalize(0, _top(errors))
-    with chart(path, _height(views, 3 if known else 2)) as figure:
+    with chart(path, _height(pictures, 3 if known else 2)) as figure:
         rows = _panels(figure, views, columns)
         for i, axes in enumerate(rows):
             _map(axes[0], shown[i], _DEPTHS, scale)
@@ -98,6 +79,59 @@ def write_depths(
         _bar(figure, rows, _DEPTHS, scale, f"depth along the ray ({unit})")
         if known:
             _bar(figure, rows, _ERRORS, error_scale, f"difference of depths ({unit})")
+
+
+#: Below each other: label, factor, figures with their dashes, and what they are.
+_ALONG = (
+    ("PSNR (dB)", 1.0, {"psnr_db": "-"}, ""),
+    ("SSIM", 1.0, {"ssim": "-"}, ""),
+    (
+        "depth error (m)",
+        1.0,
+        {"depth_median_m": "-", "depth_p90_m": "--"},
+        "solid: median; dashed: 90 % of the near rays",
+    ),
+    (
+        "rays (%)",
+        100.0,
+        {"wrong": "-", "hazy": "--"},
+        "solid: wrong opacity; dashed: hazy",
+    ),
+)
+
+
+def write_along(
+    path: str | Path, routes: Sequence[RouteComparison], limits: Mapping[str, float]
+) -> None:
+    """Plot PSNR, SSIM, depth error and wrong opacity against the arc length.
+
+    Args:
+        path: PNG file.
+        routes: a colour each.
+        limits: by figure; dotted.
+    """
+    with chart(path, 7.2) as figure:
+        axes = figure.subplots(len(_ALONG), 1, sharex=True)
+        for axis, (label, factor, dashes, about) in zip(axes, _ALONG, strict=True):
+            for name, dash in dashes.items():
+                for route, colour in zip(routes, cycle(PALETTE), strict=False):
+                    arc = [station.arc_m for station in route.stations]
+                    values = [factor * getattr(at, name) for at in route.stations]
+                    style = {"color": colour, "linewidth": 1.6, "linestyle": dash}
+                    axis.plot(arc, values, label=route.name, **style)
+                if name in limits:
+                    axis.axhline(
+                        limits[name], color="black", linewidth=1, linestyle=":"
+                    )
+            if about:
+                axis.set_ylim(bottom=0)
+                axis.set_title(about, loc="right", fontsize=8, color="#555555")
+            axis.set_ylabel(label)
+            axis.grid(alpha=0.25)
+        axes[-1].set_xlabel("arc length (m)")
+        figure.align_ylabels()
+        handles, labels = axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=6)
 
 
 def abs_difference(shown: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -131,23 +165,28 @@ def _top(maps: Sequence[np.ndarray]) -> float:
     return max(0.01, 2 * float(np.quantile(np.concatenate(finite), 0.9)))
 
 
-def _height(views: Sequence[ViewPair], columns: int) -> float:
-    height, width = views[0].depth.shape
+def _pictures(views: Sequence[ViewScore]) -> list[Pictures]:
+    return [view.pictures for view in views if view.pictures is not None]
+
+
+def _height(pictures: Sequence[Pictures], columns: int) -> float:
+    height, width = pictures[0].shown.depth.shape
     row = WIDTH_PX / DPI / columns * height / width + 0.28
-    return len(views) * row + 1.1
+    return len(pictures) * row + 1.1
 
 
 def _panels(
-    figure: Figure, views: Sequence[ViewPair], columns: Sequence[str]
+    figure: Figure, views: Sequence[ViewScore], columns: Sequence[str]
 ) -> np.ndarray:
     grid = figure.subplots(len(views), len(columns), squeeze=False)
     for view, axes in zip(views, grid, strict=True):
         for axis in axes:
             axis.set_axis_off()
-        axes[0].set_title(view.title, loc="left", fontsize=8)
+        title = f"{view.name}: {view.psnr_db:.2f} dB, SSIM {view.ssim:.3f}"
+        axes[0].set_title(title, fontsize=8)
     for axis, name in zip(grid[0], columns, strict=True):
         before = axis.get_title(loc="left")
-        axis.set_title(f"{name}\n{before}", loc="left", fontsize=8)
+        axis.set_title(f"{name}\n{before}", fontsize=8)
     return grid
 
 

@@ -7,15 +7,17 @@ from dataclasses import dataclass
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import ControlUnit, NonNegative, Positive, Seconds, checked
-from mi_nerfattack.vehicle.expert.base import AbstractExpert
-from mi_nerfattack.vehicle.expert.lane_follower import LaneFollower, SteeringFollower
-from mi_nerfattack.vehicle.expert.pid import PIDExpert
+from mi_nerfattack.vehicle.expert.lane_follower import (
+    AbstractExpert,
+    LaneFollower,
+    SteeringFollower,
+)
 from mi_nerfattack.vehicle.route.route import Route
+from mi_nerfattack.vehicle.steering import heading_rate
 
 __all__ = [
     "AbstractExpert",
     "LaneFollower",
-    "PIDExpert",
     "SteeringFollower",
     "expert_for",
 ]
@@ -50,9 +52,8 @@ def expert_for(
 ) -> AbstractExpert:
     """Make the expert of a route for a vehicle.
 
-    A heading rate is given by `LaneFollower`; a steering angle by `SteeringFollower`
-    on an open route and by `PIDExpert` on a closed one. Distances grow with the
-    route's speed.
+    `LaneFollower` gives a heading rate, `SteeringFollower` a steering angle. Distances
+    grow with the route's speed. Neither remembers anything.
 
     The lag only moves the point where the curvature is read. One policy for cars with
     and without lag cannot know which it drives: label its frames with the lag in
@@ -76,15 +77,11 @@ def expert_for(
     speed = float(route.speed_ms)
     look_ahead = speed * LOOK_AHEAD_S
     preview, window = speed * (period / 2 + lag), speed * WINDOW_S
-    if control_unit == "rad" and route.closed:
-        return PIDExpert(
-            route, period, wheelbase, max_control, look_ahead, preview, window_m=window
-        )
 
     def follower(limit: float) -> LaneFollower:
         return LaneFollower(route, speed, look_ahead, preview, 0.0, limit, window)
 
     if control_unit == "rad":
-        fastest = speed * math.tan(max_control) / wheelbase
+        fastest = heading_rate(max_control, speed, wheelbase)
         return SteeringFollower(follower(fastest), wheelbase, max_control)
     return follower(max_control)

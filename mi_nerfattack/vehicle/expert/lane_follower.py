@@ -1,15 +1,38 @@
-"""Lane follower: the expert of vehicles that take a heading rate, and its steering."""
+"""Experts, which know the true state: the interface, and followers of the lane."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 from mi_nerfattack.ranges import Acute, Positive, checked
-from mi_nerfattack.vehicle.expert.base import AbstractExpert
 from mi_nerfattack.vehicle.route.route import Route
+from mi_nerfattack.vehicle.steering import steering_angle
+
+
+class AbstractExpert(ABC):
+    """Controller of vehicles on a route by their present states alone.
+
+    Attributes:
+        control_unit: "rad/s" of a heading rate, or "rad" of a steering angle.
+    """
+
+    control_unit: ClassVar[str]
+
+    @abstractmethod
+    def control(self, states: Any) -> np.ndarray:
+        """Compute the controls of the next period.
+
+        Args:
+            states: (n, m) or (m,), m >= 3: x, y (metres), heading (radians), others
+                that are not read.
+
+        Returns:
+            (n,), positive to the left, clipped to the expert's limit.
+        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,5 +112,5 @@ class SteeringFollower(AbstractExpert):
     def control(self, states: Any) -> np.ndarray:
         """Compute steering angles (n,), radians, of states (n, m) or (m,)."""
         rate = self.follower.control(states)
-        angle = np.arctan(self.wheelbase * rate / float(self.follower.speed or 0))
+        angle = steering_angle(rate, float(self.follower.speed or 0), self.wheelbase)
         return np.clip(angle, -self.max_control, self.max_control)

@@ -8,11 +8,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
 import numpy as np
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
+from mi_nerfattack.io.positions import require_near
 from mi_nerfattack.notebook import picture
 from mi_nerfattack.ranges import Positive, Whole, checked
 from mi_nerfattack.vehicle.route.polyline import (
@@ -28,7 +28,6 @@ from mi_nerfattack.vehicle.route.polyline import (
 
 _NEEDED = ("goal", "points_m", "lane_width_m", "speed_ms")
 _NUMPY = Operations(np.where, np.sqrt, np.sin, np.cos, np.arctan2, lambda x: x)
-_DRJIT = Operations(dr.select, dr.sqrt, dr.sin, dr.cos, dr.atan2, dr.detach)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +63,7 @@ class Route:
                 f"route {self.name!r}: closed {self.closed!r}; true or false"
             )
         points = checked_points(f"route {self.name!r}", self.points, self.closed)
+        require_near(f"route {self.name!r}", points)
         points.setflags(write=False)
         object.__setattr__(self, "points", points)
 
@@ -102,6 +102,16 @@ class Route:
             return cls(name, goal, points, lane_width_m, speed_ms, closed)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
+
+    def document(self) -> dict[str, Any]:
+        """Return the route's entry of a routes file."""
+        return {
+            "goal": self.goal,
+            "points_m": self.points.tolist(),
+            "lane_width_m": self.lane_width_m,
+            "speed_ms": self.speed_ms,
+            **({"closed": True} if self.closed else {}),
+        }
 
     @cached_property
     def segments(self) -> np.ndarray:
@@ -220,9 +230,7 @@ class Route:
         Returns:
             Rows (n,), as those of `project_numpy`.
         """
-        path = _DevicePath(self, state[0])
-        nearest = path.segment(path.nearest(dr.detach(state)))
-        return measure(_DRJIT, nearest, state[0], state[1], state[2])
+        return _project(self.segments, state)
 
     def arc_length(self, state: Any) -> Any:
         """Arc length (n,) of :meth:`project`, metres, of states (m, n).
@@ -243,45 +251,40 @@ class Route:
         return self.project(state).heading_error
 
 
-class _DevicePath:
-    """The segments of a route in the memory of a Dr.Jit backend."""
+def _project(segments: np.ndarray, state: Any) -> Measures:
+    """Find the nearest point of the segments, as `Route.project` does."""
+    import drjit as dr  # which the computer of a car may lack
 
-    def __init__(self, route: Route, like: Any) -> None:
-        """Upload `route` as arrays of the type of the row `like`."""
-        self.real: Any = dr.detached_t(type(like))
-        self.integer: Any = dr.uint32_array_t(self.real)
-        # a list: memory from NumPy has an alignment of its own, and so its own kernels
-        self.rows = self.real(route.segments.ravel().tolist())
-        self.count = dr.opaque(self.integer, len(route.segments))
+    drjit = Operations(dr.select, dr.sqrt, dr.sin, dr.cos, dr.atan2, dr.detach)
+    real: Any = dr.detached_t(type(state[0]))
+    integer: Any = dr.uint32_array_t(real)
+    # a list: memory from NumPy has an alignment of its own, and so its own kernels
+    rows = real(segments.ravel().tolist())
+    count = dr.opaque(integer, len(segments))
 
-    def segment(self, index: Any) -> Segment:
-        """Look up segments."""
-        start = len(Segment._fields) * self.integer(index)
-        columns = range(len(Segment._fields))
-        return Segment(*(dr.gather(self.real, self.rows, start + i) for i in columns))
+    def segment(index: Any) -> Segment:
+        size = len(Segment._fields)
+        start = size * integer(index)
+        return Segment(*(dr.gather(real, rows, start + i) for i in range(size)))
 
-    def nearest(self, state: Any) -> Any:
-        """Find for each vehicle the first of the nearest segments, (n,)."""
-        px, py = self.real(state[0]), self.real(state[1])
+    detached = dr.detach(state)
+    px, py = real(detached[0]), real(detached[1])
 
-        def measure_one(i: Any, best: Any, shortest: Any) -> tuple[Any, Any, Any]:
-            square = square_distance(_DRJIT, self.segment(i), px, py)
-            closer = square < shortest
-            return (
-                i + 1,
-                dr.select(closer, i, best),
-                dr.select(closer, square, shortest),
-            )
+    def measure_one(i: Any, best: Any, shortest: Any) -> tuple[Any, Any, Any]:
+        square = square_distance(drjit, segment(i), px, py)
+        closer = square < shortest
+        return i + 1, dr.select(closer, i, best), dr.select(closer, square, shortest)
 
-        start = dr.zeros(self.integer, dr.width(px))
-        _, best, _ = dr.while_loop(
-            (start, dr.zeros_like(start), dr.full(self.real, dr.inf, dr.width(px))),
-            lambda i, best, shortest: i < self.count,
-            measure_one,
-            labels=("segment", "nearest", "square_distance"),
-            mode="symbolic",
-        )
-        return best
+    # the first of the nearest segments of each vehicle
+    start = dr.zeros(integer, dr.width(px))
+    _, nearest, _ = dr.while_loop(
+        (start, dr.zeros_like(start), dr.full(real, dr.inf, dr.width(px))),
+        lambda i, best, shortest: i < count,
+        measure_one,
+        labels=("segment", "nearest", "square_distance"),
+        mode="symbolic",
+    )
+    return measure(drjit, segment(nearest), state[0], state[1], state[2])
 
 
 def smooth_absolute(error: Any, width: float = 0.05) -> Any:
@@ -294,6 +297,8 @@ def smooth_absolute(error: Any, width: float = 0.05) -> Any:
     Returns:
         (n,), metres, between ``|e| - w`` and ``|e|``.
     """
+    import drjit as dr
+
     return dr.sqrt(dr.square(error) + width**2) - width
 
 
@@ -303,6 +308,9 @@ def load_routes(path: str | Path, names: Sequence[str] = ()) -> list[Route]:
 
 
 def _read_table(path: str | Path) -> dict[str, Any]:
+    if Path(path).suffix.lower() == ".csv":
+        keys = ", ".join(_NEEDED)
+        raise InputError(f"{path}: routes are JSON; write {{NAME: {{{keys}}}}}")
     table = files.read_json(path)
     if not isinstance(table, dict) or not table:
         raise InputError(f"{path}: needs an object with one key per route")

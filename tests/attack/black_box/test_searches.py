@@ -1,4 +1,4 @@
-"""Searches without derivatives: what they propose, and that they get somewhere."""
+"""Searches without derivatives, random looks: what they propose and where they get."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import astuple
 
 import numpy as np
 import pytest
-from helpers import toy_loop as toy
+from support.worlds import loops as toy
 
 from mi_nerfattack.attack.black_box import (
     BayesianSearch,
@@ -19,7 +19,7 @@ from mi_nerfattack.attack.black_box import (
     SurrogateJudge,
 )
 from mi_nerfattack.attack.black_box.low_frequency import lattice
-from mi_nerfattack.attack.black_box.random_looks import RandomLooks
+from mi_nerfattack.attack.black_box.random_looks import RandomLooks, equal_count, judge
 from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.texture.colours import Colours, vertex_colours
 from mi_nerfattack.attack.texture.constraints import Constraints
@@ -35,11 +35,11 @@ PROPOSALS = 200
 
 def grey(count: int = 1) -> list[GridField]:
     """Return boxes of one colour on one level of 8 vertices an edge."""
-    fields = []
-    for _ in range(count):
-        field = GridField(GridLayout(1, 8, 8), -np.ones(3), np.ones(3))
+    fields = [
+        GridField(GridLayout(1, 8, 8), -np.ones(3), np.ones(3)) for _ in range(count)
+    ]
+    for field in fields:
         field.set_parameter("texture", np.zeros((field.n_vertices, 3), np.float32))
-        fields.append(field)
     return fields
 
 
@@ -138,9 +138,8 @@ def test_low_frequencies_are_interpolated_and_projected():
     change = np.zeros((2, 2, 2, 2, 3))
     change[1, 1, :, :, 0] = 0.1  # more red to the right in the second
     change[1, :, :, :, 2] = 1.0  # as blue as is allowed
-    for field, texture in zip(
-        fields, basis.propose(change.ravel()).textures, strict=True
-    ):
+    textures = basis.propose(change.ravel()).textures
+    for field, texture in zip(fields, textures, strict=True):
         field.set_parameter("texture", texture)
     first, second = (vertex_colours(f, f.levels()[-1]) for f in fields)
     np.testing.assert_allclose(first, 0.5, atol=1e-6)
@@ -149,19 +148,11 @@ def test_low_frequencies_are_interpolated_and_projected():
     np.testing.assert_allclose(cube[..., 2], 0.7, atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("extent", "most", "counts"),
-    [
-        ([1, 1, 1], 1, (1, 1, 1)),
-        ([1, 1, 1], 8, (2, 2, 2)),
-        ([1, 1, 1], 27, (3, 3, 3)),
-        ([4.2, 1.8, 1.5], 3, (3, 1, 1)),
-        ([4.2, 1.8, 1.5], 14, (3, 2, 2)),
-        ([1, 1, 9], 5, (1, 1, 5)),
-    ],
-)
-def test_lattices_have_as_many_vertices_as_are_allowed(extent, most, counts):
-    assert lattice(np.array(extent, float), most) == counts
+def test_lattices_have_as_many_vertices_as_are_allowed():
+    for most, counts in ((1, (1, 1, 1)), (8, (2, 2, 2)), (27, (3, 3, 3))):
+        assert lattice(np.ones(3), most) == counts
+    car = np.array([4.2, 1.8, 1.5])
+    assert [lattice(car, most) for most in (3, 14)] == [(3, 1, 1), (3, 2, 2)]
 
 
 def test_lattices_lie_along_an_object():
@@ -200,26 +191,38 @@ def test_blocks_lie_where_the_object_is_and_shrink():
 
 def test_penalties_count(monkeypatch):
     fields = grey()
-    search = make("separable", fields)
     monkeypatch.setattr(Colours, "penalty", lambda self, value: 5.0)
-    judge = Wanted(fields)
-    judged = BlackBoxAttack(search, judge, 1).step()
-    assert judged.objective > 5
+    attack = BlackBoxAttack(make("separable", fields), Wanted(fields), 1)
+    assert attack.step().objective > 5
+
+
+def nowhere(textures, on_step=None):
+    return Judged(float("nan"), 0.0, 0.0, 4)
 
 
 @pytest.mark.parametrize(
     ("work", "message"),
     [
-        (lambda c, f: LowFrequency(c * 2, 5), "2 objects need at least 6"),
-        (lambda c, f: EvolutionSearch(LowFrequency(c, 3), "all"), "one of separable"),
-        (lambda c, f: EvolutionSearch(LowFrequency(c, 3), population=1), "at least 2"),
-        (lambda c, f: BayesianSearch(LowFrequency(c, 81)), "81; at most 64"),
+        (lambda c, f: LowFrequency(c * 2, 5), "2 .* 6"),
+        (lambda c, f: EvolutionSearch(LowFrequency(c, 3), "all"), "separable"),
+        (lambda c, f: EvolutionSearch(LowFrequency(c, 3), population=1), "2"),
+        (lambda c, f: BayesianSearch(LowFrequency(c, 81)), "81; .* 64"),
         (lambda c, f: BlockSearch(c, f, 0), "0 proposals"),
         (lambda c, f: BlockSearch(c, f, 9, 0.0), "share 0"),
         (lambda c, f: BlackBoxAttack(make("blocks", f), Wanted(f), 0), "frames: 0"),
         (
-            lambda c, f: RandomSearch(RandomLooks(f, Freedom(None, 0.1), "flat", 0)),
-            "may not change",
+            lambda c, f: RandomSearch(RandomLooks(f, Freedom(None, 1), "flat", 0)),
+            "may not",
+        ),
+        (
+            lambda c, f: BlackBoxAttack(make("blocks", f), Wanted(f), 5).load_tensors(
+                {"history": np.zeros((2, 3))}
+            ),
+            "history: shape",
+        ),
+        (
+            lambda c, f: BlackBoxAttack(make("blocks", f), nowhere, 8).step(),
+            "objective: nan",
         ),
     ],
 )
@@ -227,22 +230,6 @@ def test_what_makes_no_sense_is_refused(work, message):
     fields = grey()
     with pytest.raises(InputError, match=message):
         work([Colours(field) for field in fields], fields)
-
-
-def test_a_history_of_another_kind_is_refused():
-    attack = BlackBoxAttack(make("blocks", grey()), Wanted(grey()), 5)
-    with pytest.raises(InputError, match="history: shape"):
-        attack.load_tensors({"history": np.zeros((2, 3))})
-
-
-def test_an_objective_that_is_no_number_ends_the_attack():
-    fields = grey()
-
-    def judge(textures, on_step=None):
-        return Judged(float("nan"), 0.0, 0.0, 4)
-
-    with pytest.raises(InputError, match="objective: nan after 0 frames"):
-        BlackBoxAttack(make("blocks", fields), judge, 8).step()
 
 
 def test_drives_are_judged_as_the_gradient_judges_its_own():
@@ -256,3 +243,58 @@ def test_drives_are_judged_as_the_gradient_judges_its_own():
     assert judged.frames == 10
     found = judged.objective, judged.cross_track_mean_m, judged.cross_track_max_m
     assert found == pytest.approx(astuple(record)[1:4], rel=1e-5)
+
+
+def draws(freedom, seed=3):
+    _, field = toy.make_loop()
+    return RandomLooks([field], freedom, "mixed", seed)
+
+
+def test_what_the_attack_may_not_change_is_left_alone():
+    poses = dict(pose_rate=0.02, axes=("x", "yaw"), limit_m=0.4, limit_rad=0.2)
+    texture, pose = draws(Freedom(0.3)), draws(Freedom(None, **poses))
+    both = draws(Freedom(0.3, **poses))
+    assert texture.offsets(0) is None and pose.textures(0) is None
+    np.testing.assert_array_equal(both.textures(1)[0], texture.textures(1)[0])
+    np.testing.assert_array_equal(both.offsets(1), pose.offsets(1))
+
+
+def test_poses_fill_the_limits_and_nothing_else():
+    axes = ("x", "yaw")
+    looks = draws(Freedom(None, 0.02, axes, limit_m=0.4, limit_rad=0.2))
+    found = np.concatenate([looks.offsets(number) for number in range(400)])
+    assert not found[:, [1, 2, 3, 4]].any()
+    for column, limit in ((0, 0.4), (5, 0.2)):
+        values = found[:, column] / limit
+        assert 0.97 < values.max() <= 1 and -1 <= values.min() < -0.97
+        assert values.std() == pytest.approx(1 / np.sqrt(3), rel=0.1)
+
+
+def test_numbers_and_seeds_give_other_looks_and_again_the_same():
+    freedom = Freedom(0.3, 0.02)
+    first, again, other = draws(freedom), draws(freedom), draws(freedom, seed=4)
+    for name in ("textures", "offsets"):
+        value = np.array(getattr(first, name)(2))
+        np.testing.assert_array_equal(value, getattr(again, name)(2))
+        assert not np.array_equal(value, getattr(first, name)(3))
+        assert not np.array_equal(value, getattr(other, name)(2))
+
+
+def test_as_many_drives_as_the_attack_costs():
+    assert equal_count(16, 1.0) == 32  # a pass back like a drive: two an iteration
+    assert equal_count(16, 2.3) == 53
+    assert equal_count(1, 0.0) == 1
+
+
+def test_looks_are_judged_by_the_attacks_objective():
+    loop, field = toy.make_loop()
+    rollout = Rollout(loop, StageSum(toy.square_error), 4)
+    poses = loop.initial(np.array([[0.0, 0.35, 0.02], [0.5, -0.2, 0.0]]))
+    field.set_parameter("texture", draws(Freedom(0.3)).textures(0)[0])
+    steps = []
+    value = judge(rollout, poses, steps.append)
+    assert value == pytest.approx(rollout.run(poses).value, rel=1e-6)
+    assert steps == [0, 1, 2, 3]
+    nowhere = Rollout(loop, StageSum(lambda state: state[0] * np.nan), 2)
+    with pytest.raises(InputError, match="objective: nan"):
+        judge(nowhere, poses, None)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import toy_loop as toy
+from support.worlds import loops as toy
 
-from mi_nerfattack.attack.schedule import Schedule, has_settled
+from mi_nerfattack.attack.freedom import Schedule, has_settled
+from mi_nerfattack.attack.texture import statistics
+from mi_nerfattack.attack.texture.colours import Colours, vertex_colours
+from mi_nerfattack.attack.texture.constraints import MARGIN
+from mi_nerfattack.attack.texture.statistics import seen_weights, texture_statistics
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, GridLayout
 
@@ -22,8 +27,6 @@ def field_of(levels: int, rng: np.random.Generator) -> GridField:
 
 @pytest.mark.parametrize("levels", [1, 3, 9])
 def test_a_step_changes_colours_by_its_length_on_any_number_of_levels(levels, rng):
-    from mi_nerfattack.attack.texture.colours import Colours, vertex_colours
-
     field = field_of(levels, rng)
     colours = Colours(field)
     original = field.texture.numpy()
@@ -34,9 +37,6 @@ def test_a_step_changes_colours_by_its_length_on_any_number_of_levels(levels, rn
 
 
 def test_projection_allows_colours_and_what_was_there(rng):
-    from mi_nerfattack.attack.texture.colours import Colours
-    from mi_nerfattack.attack.texture.constraints import MARGIN
-
     field = field_of(1, rng)
     texture = field.texture.numpy().copy()
     texture[0] = 9.0  # nearly white
@@ -50,8 +50,6 @@ def test_projection_allows_colours_and_what_was_there(rng):
 
 
 def test_gradient_is_that_of_the_texture(rng):
-    from mi_nerfattack.attack.texture.colours import Colours
-
     field = field_of(3, rng)
     colours = Colours(field)
     by_texture = rng.normal(size=(field.n_vertices, 3))
@@ -63,7 +61,7 @@ def test_gradient_is_that_of_the_texture(rng):
     assert found == pytest.approx(wanted, rel=1e-3)
     level = Colours(field, resolution=8).level
     assert level.resolution == 7
-    with pytest.raises(InputError, match="resolution: 3; the coarsest level .* has 4"):
+    with pytest.raises(InputError, match="resolution: 3; .* 4"):
         Colours(field, resolution=3)
 
 
@@ -77,16 +75,14 @@ def test_rates_fall_when_nothing_more_is_gained_or_time_is_short():
     assert not short.is_over(falling[:19])
     assert not short.has_converged(falling)
     settled = [*np.linspace(1, 0.2, 8), 0.199, 0.3]
-    assert long.rate(settled[:9]) == 1.0
     assert long.rate(settled) == pytest.approx(0.01 ** (1 / 3))  # from 10 on
     assert long.has_converged(settled)
-    assert not long.is_over([*settled, 0.0, 0.0])
-    assert long.is_over([*settled, 0.0, 0.0, 0.0])
+    ending = [long.is_over([*settled, *[0.0] * count]) for count in range(4)]
+    assert ending == [False, False, False, True]
     assert long.rate([0.5] * 70) == 1.0  # stuck from the first is not converged
 
 
 def test_a_search_settles_at_its_first_fifth_without_gain(rng):
-    """By the definition, prefix by prefix."""
     for share in (0.3, 0.6, 0.9):
         moves = np.where(rng.random(120) < share, 0, rng.random(120) - 0.7)
         objectives = np.cumsum(moves).tolist()
@@ -105,10 +101,6 @@ def test_a_search_settles_at_its_first_fifth_without_gain(rng):
 
 
 def test_statistics_of_a_texture_that_is_known():
-    import mitsuba as mi
-
-    from mi_nerfattack.attack.texture.statistics import seen_weights, texture_statistics
-
     loop, grid = toy.make_loop()
     original = toy.texture_of(grid)
     states = [loop.initial(np.zeros((1, 3)))]
@@ -131,8 +123,6 @@ def test_statistics_of_a_texture_that_is_known():
 
 
 def test_measuring_that_fails_leaves_the_texture(monkeypatch):
-    from mi_nerfattack.attack.texture import statistics
-
     loop, grid = toy.make_loop()
     given = toy.texture_of(grid)
 
@@ -152,10 +142,7 @@ def test_measuring_that_fails_leaves_the_texture(monkeypatch):
     np.testing.assert_array_equal(toy.texture_of(grid), given)
 
 
-def test_spectrum_tells_fine_structure_from_coarse(variant):
-    from mi_nerfattack.attack.texture.statistics import texture_statistics
-    from mi_nerfattack.fields import GridField, GridLayout
-
+def test_spectrum_tells_fine_structure_from_coarse():
     grid = GridField(GridLayout(1, 8, 8), -np.ones(3), np.ones(3))
     original = grid.texture.numpy().copy()
     index = np.indices((8, 8, 8)).reshape(3, -1)

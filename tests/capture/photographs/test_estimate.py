@@ -3,27 +3,32 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
 from pathlib import Path
+from textwrap import indent
+from typing import Any
 
 import numpy as np
 import pytest
-from helpers.corner import CAMERA, aligned, corner_photograph, corner_poses
 from PIL import ExifTags, Image
+from support.faults.refusals import refusals
+from support.worlds.views import CAMERA, aligned, corner_photograph, corner_poses
 
 from mi_nerfattack import cli
-from mi_nerfattack.capture.photographs.estimate import (
-    PoseOptions,
-    estimate_poses,
-)
+from mi_nerfattack.capture.colmap.follow import Stages
+from mi_nerfattack.capture.colmap.process import MARK
+from mi_nerfattack.capture.photographs.estimate import PoseOptions, estimate_poses
 from mi_nerfattack.capture.photographs.staging import (
-    copy_upright,
     list_photographs,
     stage,
 )
 from mi_nerfattack.capture.transforms import read_images
 from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.io import files
-from mi_nerfattack.render.camera.intrinsics import Camera, from_fov
+from mi_nerfattack.render.camera.intrinsics import Camera, from_fov, look_at
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -37,212 +42,112 @@ def corner(tmp_path_factory):
     """A folder of photographs of the corner, and the poses found for them."""
     pytest.importorskip("pycolmap")
     root = tmp_path_factory.mktemp("corner")
-    (root / "photographs").mkdir()
+    for name in ("photographs", "masks"):
+        (root / name).mkdir()
     for i, pose in enumerate(corner_poses()):
-        files.write_image(root / "photographs" / f"{i}.png", corner_photograph(pose))
-    (root / "masks").mkdir()
-    files.write_image(root / "masks" / "0.png.png", LEFT_HALF)
+        files.write_image(root / f"photographs/{i}.png", corner_photograph(pose))
+    files.write_image(root / "masks/0.png.png", LEFT_HALF)
     flat = np.full((180, 240, 3), 90, np.uint8)
-    files.write_image(root / "photographs" / "flat.png", flat)
-    stages = []
-    options = PoseOptions(
-        lens="SIMPLE_PINHOLE", metres_per_unit=2.0, masks=root / "masks"
-    )
-    result = estimate_poses(
-        root / "photographs", root / "out", options, lambda *call: stages.append(call)
-    )
-    return root, result, stages
+    files.write_image(root / "photographs/flat.png", flat)
+    scale = {"metres_per_unit": 2.0, "masks": root / "masks"}
+    options = PoseOptions(lens="SIMPLE_PINHOLE", **scale)
+    return root, estimate_poses(root / "photographs", root / "out", options)
 
 
 class TestCorner:
-    def test_cameras_stand_where_they_stood(self, corner):
-        root, result, _ = corner
+    def test_cameras_and_points_are_where_they_were(self, corner):
+        root, result = corner
         assert result.left_out == ("flat.png",) and len(result.placed) == COUNT
-        given = corner_poses()[:, :3, 3]
-        posed = read_images(root / "out")
-        found, _ = aligned(posed.camera_to_world[:, :3, 3], given)
+        poses, posed = corner_poses(), read_images(root / "out")
+        given, eyes = poses[:, :3, 3], posed.camera_to_world[:, :3, 3]
+        found, turn = aligned(eyes, given)
         np.testing.assert_allclose(found, given, atol=0.05)
         assert result.error_px < 1
         assert result.cameras[0].fx == pytest.approx(CAMERA.fx, rel=0.05)
-
-    def test_z_points_up(self, corner):
-        posed = read_images(corner[0] / "out")
-        given = corner_poses()
-        _, turn = aligned(posed.camera_to_world[:, :3, 3], given[:, :3, 3])
-        tilt = turn.T @ [0, 0, 1]  # of the true vertical, in the estimate's world
-        mean_up = -given[:, :3, 1].mean(0)
+        # z points up, and the cameras are around the origin
+        mean_up = -poses[:, :3, 1].mean(0)
         expected = mean_up[2] / np.linalg.norm(mean_up)
-        assert tilt[2] == pytest.approx(expected, abs=5e-3)
-        np.testing.assert_allclose(
-            posed.camera_to_world[:, :3, 3].mean(0), 0, atol=1e-9
-        )
+        assert turn[2, 2] == pytest.approx(expected, abs=5e-3)
+        np.testing.assert_allclose(eyes.mean(0), 0, atol=1e-9)
+        # the similarity of the cameras carries the points to the corner's planes
+        centre = given.mean(0)
+        scale = np.linalg.norm(found - centre) / np.linalg.norm(eyes)
+        world = scale * posed.points @ turn.T + centre
+        assert np.median(np.abs(world - [3.0, 3.0, 0.0]).min(1)) < 0.03
 
     def test_a_mask_takes_features_away_and_is_written(self, corner):
-        root, result, _ = corner
+        root, result = corner
         features = result.found.features
         assert 0 < features["0.png"] < 0.75 * features["1.png"]
         masks = read_images(root / "out").masks
         np.testing.assert_array_equal(masks[0], LEFT_HALF > 0)
         assert masks[1:].all()
 
-    def test_points_lie_on_the_corner(self, corner):
-        posed = read_images(corner[0] / "out")
-        given = corner_poses()[:, :3, 3]
-        eyes = posed.camera_to_world[:, :3, 3]
-        together = np.concatenate([eyes, posed.points])
-        # carry the points along with the similarity of the cameras
-        centre, target = eyes.mean(0), given.mean(0)
-        fitted, turn = aligned(eyes, given)
-        scale = np.linalg.norm(fitted - target) / np.linalg.norm(eyes - centre)
-        world = scale * (together - centre) @ turn.T + target
-        off = np.abs(world[COUNT:] - [3.0, 3.0, 0.0]).min(1)
-        assert np.median(off) < 0.03
-
-    def test_file_says_the_unit_and_what_is_left_out(self, corner):
-        root, result, _ = corner
-        table = json.loads((root / "out/transforms.json").read_text())
+    def test_what_the_files_say(self, corner):
+        root, result = corner
+        table = files.read_json(root / "out/transforms.json")
         assert read_images(root / "out").unit == table["units"] == "metre"
         assert table["left_out"] == ["flat.png"]
-        assert sorted(p.name for p in (root / "out/images").iterdir()) == list(
-            result.placed
-        )
-        copied = (root / "out/images/0.png").read_bytes()
-        assert copied == (root / "photographs/0.png").read_bytes()
-
-    def test_report_says_what_each_gave(self, corner):
-        table = json.loads((corner[0] / "out/capture.json").read_text())
-        assert (table["placed"], table["photographs"]) == (COUNT, COUNT + 1)
-        assert table["scale"]["metres_per_unit"] == 2.0
-        assert table["retake"]["flat.png"].startswith("not placed")
-        *placed, flat = table["frames"]
+        copied = sorted(path.name for path in (root / "out/images").iterdir())
+        assert copied == list(result.placed)
+        raw = (root / "photographs/0.png").read_bytes()
+        assert (root / "out/images/0.png").read_bytes() == raw
+        report = files.read_json(root / "out/capture.json")
+        assert (report["placed"], report["photographs"]) == (COUNT, COUNT + 1)
+        assert report["scale"]["metres_per_unit"] == 2.0
+        assert list(report["retake"]) == ["flat.png"]
+        *placed, flat = report["frames"]
         assert flat["features"] < 10 and flat["points"] == 0
         for frame in placed:
             assert 20 < frame["points"] < frame["features"]
             assert 0 < frame["error_px"] < 1
 
-    def test_progress_ends_every_stage(self, corner):
-        _, _, stages = corner
-        ends = {stage: (done, total) for stage, done, total in stages}
-        n = COUNT + 1
-        assert ends == {
-            "photographs": (n, n),
-            "features": (n, n),
-            "matches": (n * (n - 1) // 2, n * (n - 1) // 2),
-            "poses": (n, n),
-        }
-
     def test_command(self, corner, tmp_path, capsys):
-        arguments = ["--matching", "sequential", "--lens", "SIMPLE_PINHOLE"]
-        code = cli.main(
-            ["capture", str(corner[0] / "photographs"), "-o", str(tmp_path), *arguments]
-        )
-        out = capsys.readouterr().out
-        assert code == 0 and f"Placed {COUNT} of {COUNT + 1} photographs" in out
-        assert "Take again: flat.png, not placed" in out and "--metres-per-unit" in out
-        assert files.read_image(tmp_path / "cameras.png").shape[2] >= 3
-        table = json.loads((tmp_path / "transforms.json").read_text())
-        assert table["units"] == "arbitrary"
-        output = str(tmp_path / "again")
-        arguments += ["-o", output, "--json"]
-        assert cli.main(["capture", str(corner[0] / "photographs"), *arguments]) == 0
-        told = json.loads(capsys.readouterr().out)
-        written = json.loads((tmp_path / "again" / "capture.json").read_text())
-        assert written.items() <= told.items() and told["placed"] == COUNT
-        assert told["transforms"] == f"{output}/transforms.json"
-        assert len(told["farthest"]) == 2 and told["distance"] > 0
+        words = ["capture", "photographs", str(corner[0] / "photographs"), "--json"]
+        words += ["--matching", "sequential", "--lens", "SIMPLE_PINHOLE"]
+        assert cli.main([*words, "-o", str(tmp_path)]) == 0
+        printed = json.loads(capsys.readouterr().out)
+        written = files.read_json(tmp_path / "capture.json")
+        assert written.items() <= printed.items() and printed["placed"] == COUNT
+        assert files.read_json(tmp_path / "transforms.json")["units"] == "arbitrary"
+        assert len(printed["farthest"]) == 2 and printed["distance"] > 0
 
 
-class TestUnusable:
-    def photographs(self, folder: Path, count: int) -> Path:
-        folder.mkdir()
-        for i in range(count):
-            image = np.full((60, 80, 3), 40 * i, np.uint8)
-            files.write_image(folder / f"{i}.jpg", image)
-        return folder
-
-    def refused(self, folder: Path, message: str, options=None) -> None:
-        out = folder.parent / "out"
-        with pytest.raises(InputError, match=message):
-            estimate_poses(folder, out, options)
-        assert not out.exists()
-
-    def test_too_few(self, tmp_path):
-        folder = self.photographs(tmp_path / "p", 2)
-        self.refused(folder, "p: 2 photographs .*at least 3")
-        self.refused(tmp_path / "none", "none: is not a folder")
-
-    def test_unreadable(self, tmp_path):
-        folder = self.photographs(tmp_path / "p", 3)
-        raw = (folder / "1.jpg").read_bytes()
-        (folder / "1.jpg").write_bytes(raw[: len(raw) // 2])
-        self.refused(folder, "1.jpg: damaged image")
-
-    def test_mixed_sizes(self, tmp_path):
-        folder = self.photographs(tmp_path / "p", 3)
-        for name in "34":
-            files.write_image(folder / f"{name}.jpg", np.zeros((80, 60, 3), np.uint8))
-        message = "p: only 3.jpg, 4.jpg of 60 x 80 px; .* at least 3 .* 2 such groups"
-        self.refused(folder, message)
-
-    def test_nothing_placed(self, tmp_path, monkeypatch):
-        pytest.importorskip("pycolmap")
-        temporary = tmp_path / "temporary"
-        temporary.mkdir()
-        monkeypatch.setenv("TMPDIR", str(temporary))
-        self.refused(self.photographs(tmp_path / "p", 3), "0 of 3 could be placed")
-        assert not list(temporary.iterdir())  # nor the log of COLMAP
-
-    def test_without_pycolmap(self, tmp_path, monkeypatch):
-        (tmp_path / "pycolmap.py").write_text("raise ImportError('gone')")
-        monkeypatch.syspath_prepend(str(tmp_path))
-        folder = self.photographs(tmp_path / "p", 3)
-        with pytest.raises(SetupError, match="pycolmap: gone; .*pip install pycolmap"):
-            estimate_poses(folder, tmp_path / "out")
-        assert not (tmp_path / "out").exists()
-
-    @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
-    def test_scale(self, scale):
-        with pytest.raises(InputError, match="metres_per_unit: .*above 0"):
-            PoseOptions(metres_per_unit=scale)
-
-    @pytest.mark.parametrize("seed", [-1, 1 << 31])
-    def test_seed(self, seed):
-        with pytest.raises(InputError, match=f"seed: {seed}; must be .* in .0, 21"):
-            PoseOptions(seed=seed)
-
-    def test_output_that_is_a_file(self, tmp_path):
-        folder = self.photographs(tmp_path / "p", 3)
-        (tmp_path / "file").write_text("x")
-        with pytest.raises(InputError, match="file"):
-            estimate_poses(folder, tmp_path / "file" / "out")
-
-    def test_turned_photographs_are_not_replaced(self, tmp_path):
-        folder = self.photographs(tmp_path / "images", 3)
-        for i in range(3):
-            write_turned(folder / f"{i}.jpg", np.zeros((60, 80, 3), np.uint8))
-        before = (folder / "0.jpg").read_bytes()
-        with pytest.raises(InputError, match="0.jpg: its EXIF data turn it"):
-            estimate_poses(folder, tmp_path)
-        assert (folder / "0.jpg").read_bytes() == before
+def flat(folder: Path, *sizes: tuple[int, int]) -> None:
+    """Write pictures without features, of these heights and widths."""
+    for i, size in enumerate(sizes):
+        image = np.full((*size, 3), 30 * i, np.uint8)
+        files.write_image(folder / f"{i}.jpg", image)
 
 
-def write_turned(path: Path, image: np.ndarray) -> None:
-    exif = Image.Exif()
-    exif[0x0112] = 6  # the camera was held upright: turn clockwise to show
-    Image.fromarray(image).save(path, exif=exif, quality=95)
+WIDE, TALL = (60, 80), (80, 60)
 
 
-def test_turned_photographs_are_stored_upright(tmp_path):
-    image = np.zeros((60, 80, 3), np.uint8)
-    image[:, :40] = 255  # left, so on top when turned clockwise
-    write_turned(tmp_path / "a.jpg", image)
-    held = copy_upright(tmp_path / "a.jpg", tmp_path / "b.jpg")
-    assert held[-3:] == (6, 60, 80)
-    shown = files.read_image(tmp_path / "b.jpg")
-    assert shown.shape == (80, 60, 3)
-    assert shown[:36].min() > 240 and shown[44:].max() < 15
-    with Image.open(tmp_path / "b.jpg") as stored:
-        assert stored.getexif().get(0x0112, 1) == 1
+@pytest.mark.parametrize(
+    ("sizes", "message"),
+    [
+        ([WIDE] * 2, "p: 2 photographs .*at least 3"),
+        ([WIDE] * 3 + [TALL] * 2, "p: only 3.jpg, 4.jpg of 60 x 80 px; .* at least 3"),
+        ([WIDE] * 3, "photographs: 0 of 3"),
+    ],
+)
+def test_unusable_photographs(tmp_path, sizes, message, monkeypatch):
+    pytest.importorskip("pycolmap")
+    for name in ("p", "temporary"):
+        (tmp_path / name).mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
+    flat(tmp_path / "p", *sizes)
+    with pytest.raises(InputError, match=message):
+        estimate_poses(tmp_path / "p", tmp_path / "out")
+    assert not (tmp_path / "out").is_dir()
+    assert not list((tmp_path / "temporary").iterdir())  # nor the log of COLMAP
+
+
+test_refused = refusals(
+    (lambda: PoseOptions(metres_per_unit=0.0), "metres_per_unit: 0.0"),
+    (lambda: PoseOptions(seed=1 << 31), "seed: 2147483648"),
+    (lambda at: list_photographs(at / "none"), "none: is not a folder"),
+)
 
 
 def photograph_with(path: Path, image: np.ndarray, focal_mm: float, turn: int) -> None:
@@ -259,11 +164,8 @@ class TestMixedSet:
 
     def taken(self, i: int) -> tuple[Camera, float, int]:
         """Return lens, focal length and turn of the i-th photograph."""
-        wide, tele, tall = (
-            CAMERA,
-            from_fov(240, 180, 45.0),
-            Camera(180, 240, CAMERA.fx, CAMERA.fy, 90, 120),
-        )
+        wide, tele = CAMERA, from_fov(240, 180, 45.0)
+        tall = Camera(180, 240, CAMERA.fx, CAMERA.fy, 90, 120)
         return [(wide, 4.0, 0), (tall, 4.0, 1), (tele, 6.5, 0), (tall, 4.0, 3)][i % 4]
 
     def photographs(self, folder: Path, count: int) -> np.ndarray:
@@ -275,33 +177,29 @@ class TestMixedSet:
             photograph_with(folder / f"{i:02d}.jpg", image, focal, turn)
         return poses
 
-    def test_groups(self, tmp_path):
-        self.photographs(tmp_path / "p", 12)
-        (tmp_path / "staged").mkdir()
+    def test_groups_of_upright_copies(self, tmp_path):
+        poses = self.photographs(tmp_path / "p", 12)
+        staged = files.make_folder(tmp_path / "staged")
         names = list_photographs(tmp_path / "p")
-        groups = stage(tmp_path / "p", names, tmp_path / "staged", lambda *_: None)
-        found = {(held.focal_mm, held.orientation): held for held in groups}
-        sizes = {key: (held.width, held.height) for key, held in found.items()}
-        assert sizes == {
-            ("4.0", 1): (240, 180),
-            ("4.0", 6): (180, 240),
-            ("6.5", 1): (240, 180),
-            ("4.0", 8): (180, 240),
-        }
+        groups = stage(tmp_path / "p", names, staged, lambda *_: None)
+        sizes = {(h.focal_mm, h.orientation): (h.width, h.height) for h in groups}
+        wide, tall = (240, 180), (180, 240)
+        expected = {("4.0", 1): wide, ("4.0", 6): tall, ("6.5", 1): wide}
+        assert sizes == {**expected, ("4.0", 8): tall}
         assert [len(group) for group in groups.values()] == [3, 3, 3, 3]
-        assert str(found["4.0", 6]) == (
-            "Analytic, 4.0 mm, 180 x 240 px, turned by EXIF data (6)"
-        )
-        upright_one = files.read_image(tmp_path / "staged/01.jpg").astype(float)
-        wanted = corner_photograph(corner_poses(12)[1], self.taken(1)[0])
-        assert np.abs(upright_one - wanted).mean() < 8
+        for i in (1, 3):
+            with Image.open(staged / f"{i:02d}.jpg") as copy:
+                assert copy.getexif().get(ExifTags.Base.Orientation, 1) == 1
+            shown = files.read_image(staged / f"{i:02d}.jpg").astype(float)
+            wanted = corner_photograph(poses[i], self.taken(i)[0])
+            assert np.abs(shown - wanted).mean() < 8
 
-    def test_too_few_held_one_way(self, tmp_path):
-        self.photographs(tmp_path / "p", 10)
-        message = "only 02.jpg, 06.jpg of Analytic, 6.5 mm, .* at least 3"
-        with pytest.raises(InputError, match=message):
-            estimate_poses(tmp_path / "p", tmp_path / "out")
-        assert not (tmp_path / "out").exists()
+    def test_is_not_replaced_by_upright_copies(self, tmp_path):
+        self.photographs(tmp_path / "images", 12)
+        before = (tmp_path / "images/01.jpg").read_bytes()
+        with pytest.raises(InputError, match="images/01.jpg: its EXIF"):
+            estimate_poses(tmp_path / "images", tmp_path)
+        assert (tmp_path / "images/01.jpg").read_bytes() == before
 
     @pytest.mark.slow
     def test_is_placed_whole(self, tmp_path):
@@ -320,25 +218,161 @@ class TestMixedSet:
         assert posed.cameras == result.cameras and not posed.has_one_size
 
 
-@pytest.mark.slow
-def test_fox_stands_where_it_stood(data_folder, tmp_path):
-    """Twelve photographs of 480 px against the poses that come with them."""
+LENS = replace(CAMERA, cx=140.0)  # of 240 px: 20 beside the middle
+
+
+def placed_by(
+    poses: np.ndarray, folder: Path, camera: Camera = LENS, lens: Any = "SIMPLE_PINHOLE"
+) -> Camera:
+    """Return the camera that is found of photographs by `camera`."""
     pytest.importorskip("pycolmap")
-    given = read_images(data_folder / "fox", 480, skip_missing=True)
-    (tmp_path / "p").mkdir()
-    chosen = list(range(0, 24, 2))
-    for i in chosen:
-        name = Path(given.names[i]).stem
-        files.write_image(tmp_path / "p" / f"{name}.png", given.images[i])
-    result = estimate_poses(tmp_path / "p", tmp_path / "out")
-    assert len(result.placed) == len(chosen)
-    stems = [Path(name).stem for name in given.names]
-    index = [stems.index(Path(name).stem) for name in result.placed]
-    eyes = given.camera_to_world[index, :3, 3]
-    posed = read_images(result.path)
-    found, _ = aligned(posed.camera_to_world[:, :3, 3], eyes)
-    error = np.linalg.norm(found - eyes, axis=1)
-    extent = np.linalg.norm(eyes - eyes.mean(0), axis=1).max()
-    assert np.median(error) < 0.01 * extent
-    assert isinstance(posed.camera, Camera) and posed.images.shape[1:3] == (480, 270)
-    assert posed.camera.fx == pytest.approx(given.camera.fx, rel=0.02)
+    photographs = files.make_folder(folder / "photographs")
+    for i, pose in enumerate(poses):
+        files.write_image(photographs / f"{i:02}.png", corner_photograph(pose, camera))
+    result = estimate_poses(photographs, folder / "out", PoseOptions(lens=lens))
+    assert len(result.placed) == len(poses)
+    return result.cameras[0]
+
+
+@pytest.mark.slow
+def test_many_photographs_tell_where_a_lens_sits(tmp_path):
+    """Until it is found beside the middle, cameras seem turned, by 5.5 degrees."""
+    poses = corner_poses(20)
+    for pose, angle in zip(poses, np.linspace(-0.8, 0.8, len(poses)), strict=True):
+        turn = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        pose[:3, :2] = pose[:3, :2] @ turn
+    assert placed_by(poses, tmp_path).cx == pytest.approx(LENS.cx, abs=3)
+    found = read_images(tmp_path / "out").camera_to_world
+    _, turn = aligned(found[:, :3, 3], poses[:, :3, 3])
+    cosine = ((turn @ found[:, :3, 2, None])[..., 0] * poses[:, :3, 2]).sum(1)
+    assert np.degrees(np.arccos(cosine.min())) < 2.5
+
+
+@pytest.mark.slow
+def test_a_camera_that_goes_where_it_looks_leaves_the_lens_in_the_middle(tmp_path):
+    """Nothing tells a lens beside the middle from a camera that looks aside."""
+    eyes = np.linspace([-0.5, -0.5, 1.6], [1.0, 1.0, 1.4], 20)
+    poses = np.stack([look_at(eye, np.array([3.0, 3.0, 17 / 15])) for eye in eyes])
+    assert placed_by(poses, tmp_path).cx == 120
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("focal_px", [120.0, 220.0])
+def test_fisheyes_of_150_and_80_degrees_are_placed(tmp_path, focal_px):
+    """EXIF data say no focal length here, which COLMAP does not find of a fisheye."""
+    lens = Camera(320, 240, focal_px, focal_px, 160.0, 120.0, 0.05, is_fisheye=True)
+    poses = corner_poses(10)
+    found = placed_by(poses, tmp_path, lens, "OPENCV_FISHEYE")
+    assert found.is_fisheye and found.fx == pytest.approx(focal_px, rel=0.03)
+    eyes = read_images(tmp_path / "out").camera_to_world[:, :3, 3]
+    np.testing.assert_allclose(
+        aligned(eyes, poses[:, :3, 3])[0], poses[:, :3, 3], atol=0.05
+    )
+
+
+def test_without_the_package_the_message_names_it(tmp_path, monkeypatch):
+    path = tmp_path / "a.heic"
+    path.write_bytes(b"\0\0\0\x18ftypheic" + bytes(40))
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(InputError, match=f"{path}: .*pillow-heif"):
+        files.read_image(path)
+
+
+def test_photographs_are_read_and_staged_as_jpeg(tmp_path):
+    pytest.importorskip("pillow_heif").register_heif_opener()
+    taken, staged = (files.make_folder(tmp_path / name) for name in ("taken", "staged"))
+    ramp = np.linspace(0, 255, 64 * 48 * 3).reshape(48, 64, 3).astype(np.uint8)
+    exif = Image.Exif()
+    exif[0x010F] = "Maker"
+    for i in range(3):
+        image = Image.fromarray(ramp)
+        image.save(taken / f"{i}.HEIC", "HEIF", quality=100, exif=exif)
+    groups = stage(taken, list_photographs(taken), staged, lambda *_: None)
+    (held,) = groups
+    assert held.make == "Maker" and (held.width, held.height) == (64, 48)
+    assert groups[held] == [f"{i}.HEIC.jpg" for i in range(3)]
+    for path in (taken / "0.HEIC", staged / "0.HEIC.jpg"):
+        assert abs(files.read_image(path).astype(int) - ramp).max() < 12
+    with Image.open(staged / "0.HEIC.jpg") as copy:
+        assert copy.format == "JPEG"
+
+
+PYCOLMAP = """
+import os, pathlib, signal, sys, time
+class CameraMode: SINGLE = 0
+class logging: logtostderr = False
+def set_random_seed(seed): pass
+def ImageReaderOptions(**_): pass
+def FeatureExtractionOptions(**_): pass
+def extract_features(database, *_):
+"""
+
+
+class TestProcess:
+    """pycolmap's process, with modules of its name that fail on purpose."""
+
+    @pytest.fixture
+    def poses(self, tmp_path, monkeypatch):
+        """Estimate poses with a pycolmap whose extract_features is the given code."""
+        folder = files.make_folder(tmp_path / "p")
+        for i in range(3):
+            files.write_image(folder / f"{i}.jpg", np.full((60, 80, 3), i, np.uint8))
+
+        def call(code: str, progress=lambda *_: None) -> None:
+            (tmp_path / "pycolmap.py").write_text(PYCOLMAP + indent(code, "    "))
+            monkeypatch.syspath_prepend(str(tmp_path))
+            estimate_poses(folder, tmp_path / "out", progress=progress)
+
+        return call
+
+    @pytest.mark.parametrize(
+        ("code", "message"),
+        [
+            ("os.kill(os.getpid(), signal.SIGBUS)", "SIGBUS at the stage 'features'"),
+            ("os.kill(os.getpid(), signal.SIGKILL)", "SIGKILL .*E full.*--long-edge"),
+            ("raise ZeroDivisionError('why')", "code 1 .*ZeroDivisionError: why"),
+        ],
+    )
+    def test_crash_is_a_message(self, poses, tmp_path, code, message):
+        with pytest.raises(SetupError, match=message):
+            poses(f"print('E full', flush=True)\n{code}")
+        assert not (tmp_path / "out").exists()
+
+    def test_interrupt_ends_the_process(self, poses, tmp_path):
+        pid, seen = tmp_path / "pid", []
+        code = (
+            f"pathlib.Path({str(pid)!r}).write_text(str(os.getpid()))\n"
+            "print('I Processed file [2/3]', flush=True)\ntime.sleep(100)\n"
+        )
+
+        def interrupt(*call) -> None:
+            seen.append(call)
+            if call == ("features", 2, 3):
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            poses(code, interrupt)
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(pid.read_text()), 0)
+        assert ("features", 0, 3) in seen
+
+    def test_process_ends_with_its_parent(self, tmp_path):
+        (tmp_path / "pycolmap.py").write_text("import time\ntime.sleep(100)\n")
+        command = [sys.executable, "-m", "mi_nerfattack.capture.colmap.process"]
+        task = json.dumps({"work": "", "folder": "", "groups": []})
+        environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+        result = subprocess.run(command, input=task + "\n", text=True, env=environment)
+        assert result.returncode == 1
+
+    def test_progress_of_a_log_line(self):
+        for line, done in (
+            ("Processed file [3/4]", 45),
+            ("Processing image [3/4]", 30),
+            ("Processing block [1/3, 3/3]", 13),
+            ("Processing block [3/3, 1/3]", 40),
+        ):
+            calls = []
+            stages = Stages(lambda *call, calls=calls: calls.append(call))
+            begun = MARK + json.dumps({"stage": "s", "total": 60})
+            stages.follow([begun, f"I2026 7 pairing.cc:2] {line}\n"])
+            assert calls == [("s", 0, 60), ("s", done, 60)]

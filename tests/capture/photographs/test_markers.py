@@ -45,21 +45,12 @@ def draw(image: np.ndarray, camera: Camera, pose: np.ndarray, marker, place, edg
     metres = edge / (8 * CELLS_PX)
     corner, right, down = (np.array(v, float) for v in place)
     # pixels of OpenCV, from the centre of the first one, to metres on the marker
-    plane = np.stack([right, down, corner], axis=1) @ np.array(
-        [
-            [metres, 0, (0.5 - CELLS_PX) * metres],
-            [0, metres, (0.5 - CELLS_PX) * metres],
-            [0, 0, 1],
-        ]
-    )
+    first = (0.5 - CELLS_PX) * metres
+    to_metres = np.array([[metres, 0, first], [0, metres, first], [0, 0, 1]])
+    plane = np.stack([right, down, corner], axis=1) @ to_metres
     plane[:, 2] -= pose[:3, 3]
-    lens = np.array(
-        [
-            [camera.fx, 0, camera.cx - 0.5],
-            [0, camera.fy, camera.cy - 0.5],
-            [0, 0, 1],
-        ]
-    )
+    cx, cy = camera.cx - 0.5, camera.cy - 0.5
+    lens = np.array([[camera.fx, 0, cx], [0, camera.fy, cy], [0, 0, 1]])
     homography = lens @ pose[:3, :3].T @ plane
     size = camera.width, camera.height
     shown = cv2.warpPerspective(pattern, homography, size, flags=cv2.INTER_AREA)
@@ -70,20 +61,18 @@ def draw(image: np.ndarray, camera: Camera, pose: np.ndarray, marker, place, edg
 def photographs(folder, places, edges=None):
     """Write frames; return a structure in another unit and frame, and true poses."""
     fine, camera = from_fov(1280, 960, 60.0), from_fov(640, 480, 60.0)
-    angles = np.linspace(-0.6, 0.6, 6)
-    poses = np.stack(
-        [
-            look_at([1.2 * np.sin(a), -1.0 * np.cos(a), 0.9 + 0.2 * a], [0.1, 0.3, 0.1])
-            for a in angles
-        ]
-    )
+    eyes = [
+        [1.2 * np.sin(a), -1.0 * np.cos(a), 0.9 + 0.2 * a]
+        for a in np.linspace(-0.6, 0.6, 6)
+    ]
+    poses = np.stack([look_at(eye, [0.1, 0.3, 0.1]) for eye in eyes])
     names = tuple(f"{i}.png" for i in range(len(poses)))
     for name, pose in zip(names, poses, strict=True):
         image = np.full((960, 1280), 110, np.uint8)
         for marker, place in places.items():
             draw(image, fine, pose, marker, place, (edges or {}).get(marker, EDGE_M))
         small = cv2.resize(image, (640, 480), interpolation=cv2.INTER_AREA)
-        files.write_image(folder / name, np.repeat(small[..., None], 3, axis=2))
+        files.write_image(folder / name, small)
     turn = Rotation.from_euler("xyz", [0.7, -0.4, 1.1]).as_matrix()
     moved = poses.copy()
     moved[:, :3, :3] = turn @ poses[:, :3, :3]
@@ -104,12 +93,9 @@ def test_scale_within_a_percent(tmp_path):
     assert set(scale.markers) == {3, 7, 9} and min(scale.markers.values()) >= 4
     assert scale.metres_per_unit == pytest.approx(UNIT_M, rel=0.01)
     assert scale.spread < 0.01
-    eyes, true = result.camera_to_world[:, :3, 3], poses[:, :3, 3]
-    np.testing.assert_allclose(
-        np.linalg.norm(eyes - eyes[0], axis=1),
-        np.linalg.norm(true - true[0], axis=1),
-        atol=0.01,
-    )
+    moved, true = (p[:, :3, 3] - p[0, :3, 3] for p in (result.camera_to_world, poses))
+    lengths = [np.linalg.norm(steps, axis=1) for steps in (moved, true)]
+    np.testing.assert_allclose(*lengths, atol=0.01)
 
 
 def test_flat_markers_are_the_ground(lying):
@@ -123,81 +109,92 @@ def test_flat_markers_are_the_ground(lying):
     assert np.degrees(np.arccos((up * true).sum(1))).max() < 0.5
 
 
-def test_wrong_corners_in_one_photograph_count_little(lying, monkeypatch):
+def test_wrong_corners_count_little_and_doubled_markers_nothing(lying, monkeypatch):
     folder, found, _ = lying
-    calls = []
+    image = files.read_image(folder / "2.png")[..., 0]
+    assert set(detect_markers(image, FAMILY)) == {3, 7}
+    assert detect_markers(np.concatenate([image, image], axis=1), FAMILY) == {}
+    off = iter([0.0, 30.0, 0.0, 0.0, 0.0, 0.0])
 
     def detect(grey, family):
-        calls.append(None)
-        off = 30.0 * (len(calls) == 2)
-        return {k: c + off for k, c in detect_markers(grey, family).items()}
+        shift = next(off)
+        return {k: c + shift for k, c in detect_markers(grey, family).items()}
 
     monkeypatch.setattr(module, "detect_markers", detect)
     seen = find_markers(folder, found, Markers(EDGE_M, FAMILY))
-    assert len(calls) == len(found.names)
+    assert list(off) == []
     assert seen.scale(EDGE_M)[0] == pytest.approx(UNIT_M, rel=0.01)
 
 
-def test_an_id_seen_twice_is_left_out(lying):
-    image = files.read_image(lying[0] / "2.png")[..., 0]
-    assert set(detect_markers(image, FAMILY)) == {3, 7}
-    twice = np.concatenate([image, image], axis=1)
-    assert detect_markers(twice, FAMILY) == {}
+@pytest.mark.parametrize(
+    ("edges", "flat", "message"),
+    [
+        ({9: 0.22}, False, r"markers: .* 0.16 m, .* \(9: 0.2[12]"),
+        ({}, True, "markers: .* common plane"),
+    ],
+)
+def test_markers_that_do_not_fit_are_refused(tmp_path, edges, flat, message):
+    found, _ = photographs(tmp_path, {**LYING, **STANDING}, edges)
+    with pytest.raises(InputError, match=message):
+        align(found, tmp_path, Markers(EDGE_M, FAMILY, flat=flat))
 
 
-class TestRefused:
-    def test_markers_of_two_sizes(self, tmp_path):
-        places = {**LYING, **STANDING}
-        found, _ = photographs(tmp_path, places, {9: 0.22})
-        with pytest.raises(InputError, match=r"edges are 0.16 m, .* \(9: 0.2[12]"):
-            align(found, tmp_path, Markers(EDGE_M, FAMILY))
-
-    def test_markers_that_stand_are_not_flat(self, tmp_path):
-        found, _ = photographs(tmp_path, {**LYING, **STANDING})
-        with pytest.raises(InputError, match="edges off their common plane"):
-            align(found, tmp_path, Markers(EDGE_M, FAMILY, flat=True))
-
-    def test_markers_never_seen(self, lying):
-        folder, found, _ = lying
-        with pytest.raises(InputError, match="0 seen of 4x4_50 in 6 placed .* family"):
-            align(found, folder, Markers(EDGE_M, "4x4_50"))
-
-    def test_one_photograph_gives_no_depth(self, lying):
-        folder, found, _ = lying
-        parts = ("names", "camera_to_world", "cameras")
-        one = replace(found, **{part: getattr(found, part)[:1] for part in parts})
-        with pytest.raises(InputError, match="2 seen .* none in two from places apart"):
-            align(one, folder, Markers(EDGE_M, FAMILY))
-
-    def test_without_opencv(self, lying, monkeypatch):
-        monkeypatch.setitem(sys.modules, "cv2", None)
-        with pytest.raises(SetupError, match=re.escape(install_hint("markers"))):
-            align(lying[1], lying[0], Markers(EDGE_M, FAMILY))
-
-    @pytest.mark.parametrize(
-        ("arguments", "message"),
-        [((0.0,), "edge_m: 0.0"), ((0.1, "7x8"), "'7x8'; must be one of 4x4_50")],
-    )
-    def test_options(self, arguments, message):
-        with pytest.raises(InputError, match=message):
-            Markers(*arguments)
-
-    def test_one_scale(self):
-        with pytest.raises(InputError, match="metres_per_unit, markers: .* give one"):
-            PoseOptions(metres_per_unit=2.0, markers=Markers(0.1))
+def test_a_fisheye_sees_markers_behind_it(tmp_path, monkeypatch):
+    """Ideal fisheyes, r = f angle, 95 to 105 degrees turned away from a marker."""
+    camera = Camera(640, 640, 160.0, 160.0, 320.0, 320.0, is_fisheye=True)
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, -1, 0], [0, -1, 0]]) * EDGE_M
+    poses, sights = [], []
+    for k, angle in enumerate(np.linspace(-0.6, 0.6, 6)):
+        eye = np.array([1.2 * np.sin(angle), -1.0 * np.cos(angle), 0.9])
+        pose = look_at(eye, corners.mean(0))
+        aside = Rotation.from_euler("y", 95 + 2 * k, degrees=True).as_matrix()
+        pose[:3, :3] = pose[:3, :3] @ aside
+        local = (corners - eye) @ pose[:3, :3]
+        assert (local[:, 2] < 0).all()
+        across = np.hypot(local[:, 0], local[:, 1])
+        radius = camera.fx * np.arctan2(across, local[:, 2])
+        poses.append(pose)
+        sights.append({3: 320 + local[:, :2] * (radius / across)[:, None]})
+        files.write_image(tmp_path / f"{k}.png", np.zeros((4, 4, 3), np.uint8))
+    names = tuple(f"{k}.png" for k in range(6))
+    found = Structure(names, np.array(poses), (camera,) * 6, np.zeros((0, 3)), 0.5)
+    shown = iter(sights)
+    monkeypatch.setattr(module, "detect_markers", lambda grey, family: next(shown))
+    seen = find_markers(tmp_path, found, Markers(EDGE_M, FAMILY))
+    np.testing.assert_allclose(seen.corners[3], corners, atol=1e-6)
 
 
-class TestDistance:
-    def test_tells_the_scale(self, lying):
-        folder, found, poses = lying
-        apart = float(np.linalg.norm(poses[0, :3, 3] - poses[5, :3, 3]))
-        _, scale = align(found, folder, Distance("0.png", "5.png", apart))
+SCALES = [
+    (6, lambda: Markers(EDGE_M, "4x4_50"), "markers: 0 seen of 4x4_50"),
+    (1, lambda: Markers(EDGE_M, FAMILY), "markers: 2 seen"),
+    (6, lambda: Markers(0.0), "edge_m: 0.0"),
+    (6, lambda: Markers(0.1, "7x8"), "markers: '7x8'; .*4x4_50"),
+    (6, lambda: Distance("0.png", "x.png", 1.0), "distance: 'x.png' .*0.png"),
+    (6, lambda: Distance("0.png", "0.png", 1.0), "distance: 0.png and 0.png"),
+    (6, lambda: Distance("0.png", "5.png", -1.0), "distance.metres: -1.0"),
+    (6, lambda: PoseOptions(metres_per_unit=2.0, markers=Markers(0.1)), "give one"),
+]
+
+
+@pytest.mark.parametrize(("count", "make", "message"), SCALES)
+def test_scales_that_are_none_are_refused(lying, count, make, message):
+    folder, found, _ = lying
+    parts = ("names", "camera_to_world", "cameras")
+    few = replace(found, **{part: getattr(found, part)[:count] for part in parts})
+    with pytest.raises(InputError, match=message):
+        align(few, folder, make())
+
+
+def test_without_opencv(lying, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(SetupError, match=re.escape(install_hint("markers"))):
+        align(lying[1], lying[0], Markers(EDGE_M, FAMILY))
+
+
+def test_a_distance_tells_the_scale(lying):
+    folder, found, poses = lying
+    apart = float(np.linalg.norm(poses[0, :3, 3] - poses[5, :3, 3]))
+    found = replace(found, names=("a.HEIC.jpg", *found.names[1:]))
+    for first in ("a.HEIC", "a.HEIC.jpg"):  # the photograph, or its copy
+        _, scale = align(found, folder, Distance(first, "5.png", apart))
         assert scale.metres_per_unit == pytest.approx(UNIT_M)
-
-    def test_between_photographs_that_were_placed(self, lying):
-        with pytest.raises(InputError, match="'x.png' is not one of the 6 .*0.png"):
-            align(lying[1], lying[0], Distance("0.png", "x.png", 1.0))
-        with pytest.raises(InputError, match="0.png and 0.png were taken at one"):
-            align(lying[1], lying[0], Distance("0.png", "0.png", 1.0))
-        with pytest.raises(InputError, match="distance.metres: -1.0"):
-            Distance("0.png", "5.png", -1.0)

@@ -8,20 +8,12 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from support.faults.refusals import refusals
 
-from bench.driving import circle
 from mi_nerfattack.deploy.car import CAR, SMALL_CAR
 from mi_nerfattack.deploy.mujoco import car as mjcf_car
 from mi_nerfattack.deploy.mujoco.car import Handling, ackermann_angles
-from mi_nerfattack.deploy.mujoco.vehicle import (
-    HeadingRate,
-    MujocoVehicle,
-    SteeringAngle,
-    steering_of,
-)
-from mi_nerfattack.errors import InputError
-
-CARS = pytest.mark.parametrize("car", [CAR, SMALL_CAR], ids=["full", "small"])
+from mi_nerfattack.deploy.mujoco.vehicle import MujocoVehicle, SteeringAngle
 
 
 def moving(car=CAR, speed=5.0, pose=(0.0, 0.0, 0.0), **options) -> MujocoVehicle:
@@ -30,213 +22,195 @@ def moving(car=CAR, speed=5.0, pose=(0.0, 0.0, 0.0), **options) -> MujocoVehicle
     return vehicle
 
 
-@pytest.mark.parametrize("steer", [0.1, -0.3, 0.5])
-@pytest.mark.parametrize("speed", [3.0, 5.0])
-def test_turn_radius_is_that_of_the_bicycle_model(steer, speed):
-    driven = circle.drive_circle(
-        circle.Case("full-size car", abs(steer), speed), share=0.3
-    )
-    assert driven.demand < 0.6
-    assert abs(driven.error) < 0.05
-    assert driven.speed_ms == pytest.approx(speed, rel=0.01)
-    vehicle = moving(speed=speed)
-    for _ in range(20):
-        vehicle.advance(steer)
-    rate = speed / CAR.wheelbase * math.tan(steer)
-    assert vehicle.state[5] == pytest.approx(rate, rel=0.02)  # and its sign
+def turn(vehicle: MujocoVehicle, control: float, count: int) -> np.ndarray:
+    """Advance with one control; return the state after each period (count, 6)."""
+    states = []
+    for _ in range(count):
+        vehicle.advance(control)
+        states.append(vehicle.state)
+    return np.array(states)
 
 
-@pytest.mark.parametrize("steer", [0.1, 0.2, 0.3])
-@pytest.mark.parametrize("speed", [0.5, 1.5])
-def test_turn_radius_of_the_small_car(steer, speed):
-    driven = circle.drive_circle(circle.Case("small car", steer, speed), share=0.3)
-    assert abs(driven.error) < 0.05
+def fit_circle(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Fit a circle to points (n, 2): centre and radius, least squares (Kasa 1976)."""
+    columns = np.concatenate([2 * points, np.ones((len(points), 1))], axis=1)
+    solution, *_ = np.linalg.lstsq(columns, (points**2).sum(axis=1), rcond=None)
+    centre = solution[:2]
+    return centre, math.sqrt(solution[2] + centre @ centre)
+
+
+def drive_circle(car, steer, speed, share=0.3, **options) -> tuple[float, np.ndarray]:
+    """Drive a share of a circle, after 3 s in which the steering settles.
+
+    Returns:
+        relative error of the radius against the bicycle model's, l / tan(steer); the
+        states (n, 6).
+    """
+    expected = car.wheelbase / math.tan(abs(steer))
+    vehicle = moving(car, speed, **options)
+    turn(vehicle, steer, 30)
+    count = math.ceil(share * 2 * math.pi * expected / speed / 0.1)
+    states = turn(vehicle, steer, count)
+    error = fit_circle(states[:, :2])[1] / expected - 1
+    print(f"wheelbase {car.wheelbase} m, {steer} rad, {speed} m/s: {error:+.2%}")
+    return error, states
+
+
+@pytest.mark.parametrize(
+    ("car", "steer", "speed"),
+    [
+        (CAR, 0.1, 5.0),
+        (CAR, -0.3, 3.0),
+        (CAR, 0.5, 5.0),
+        (SMALL_CAR, 0.1, 1.5),
+        (SMALL_CAR, -0.3, 0.5),
+        (SMALL_CAR, 0.3, 1.5),
+    ],
+)
+def test_turn_radius_is_that_of_the_bicycle_model(car, steer, speed):
+    error, states = drive_circle(car, steer, speed)
+    assert abs(error) < 0.01
+    assert states[:, 3].mean() == pytest.approx(speed, rel=0.01)
+    rate = speed / car.wheelbase * math.tan(steer)
+    assert states[-1, 5] == pytest.approx(rate, rel=0.02)  # and its sign
 
 
 def test_heading_rate_becomes_a_steering_angle():
-    vehicle = MujocoVehicle(CAR)
-    assert vehicle.control_unit == "rad/s"
+    vehicle, small = MujocoVehicle(CAR), MujocoVehicle(SMALL_CAR)
+    assert (vehicle.control_unit, small.control_unit) == ("rad/s", "rad")
     vehicle.reset(np.array([1.0, 2.0, 0.5]), 5.0)
-    start = vehicle.state
-    for _ in range(40):
-        vehicle.advance(0.6)
-    settled = vehicle.state
+    assert vehicle.state[2] == 0.5
+    settled = turn(vehicle, 0.6, 40)[-1]
     assert settled[4] == pytest.approx(math.atan(2.7 * 0.6 / 5.0), rel=1e-2)
     assert settled[5] == pytest.approx(0.6, rel=0.02)
-    for _ in range(30):
-        vehicle.advance(0.6)
-    turned = vehicle.state[2] - settled[2]
-    assert turned == pytest.approx(0.6 * 3.0, rel=0.02)
-    assert start[2] == 0.5
-    assert vehicle.state[2] > math.pi  # not wrapped
+    end = turn(vehicle, 0.6, 30)[-1, 2]
+    assert end - settled[2] == pytest.approx(0.6 * 3.0, rel=0.02)
+    assert end > math.pi  # not wrapped
 
 
-def test_what_a_control_means_follows_from_the_car():
-    assert isinstance(steering_of(CAR), HeadingRate)
-    assert isinstance(steering_of(SMALL_CAR), SteeringAngle)
-    vehicle = MujocoVehicle(SMALL_CAR)
-    assert (vehicle.control_unit, vehicle.max_control) == ("rad", SMALL_CAR.max_control)
-
-
-@CARS
-def test_straight_stays_straight_and_level(car):
-    speed = 5.0 if car is CAR else 1.0
+@pytest.mark.parametrize(("car", "speed"), [(CAR, 5.0), (SMALL_CAR, 1.0)])
+def test_straight_stays_straight_and_level(car, speed):
+    """From the first millisecond on: a reset starts without a jump."""
     heading = 0.7
-    vehicle = moving(car, speed, (3.0, -2.0, heading))
-    for _ in range(round(10 / speed / 0.1)):
+    vehicle = moving(car, speed, (3.0, -2.0, heading), period=mjcf_car.MAX_TIMESTEP)
+    states, heights = [], []
+    for _ in range(round(10 / speed / mjcf_car.MAX_TIMESTEP)):
         vehicle.advance(0.0)
-    x, y, theta, driven, steer, rate = vehicle.state
+        states.append(vehicle.state)
+        heights.append(vehicle.body_to_world[2, 3])
+    assert np.ptp(heights[:100]) < 1e-5 * car.wheelbase
+    assert abs(heights[-1]) < 1e-4 * car.wheelbase
+    x, y, theta, driven, steer, rate = np.transpose(states)
+    np.testing.assert_allclose(driven, speed, rtol=2e-3)
+    assert driven[-1] == pytest.approx(speed, rel=1e-3)
     along = (x - 3) * math.cos(heading) + (y + 2) * math.sin(heading)
     across = (y + 2) * math.cos(heading) - (x - 3) * math.sin(heading)
-    assert abs(across) < 1e-3
-    assert along == pytest.approx(10.0, abs=0.01)
-    assert driven == pytest.approx(speed, rel=1e-3)
-    assert abs(theta - heading) < 1e-4
-    assert abs(steer) < 1e-5
-    assert abs(rate) < 1e-4
+    assert along[99] == pytest.approx(100 * mjcf_car.MAX_TIMESTEP * speed, rel=1e-3)
+    assert np.abs(across).max() < 1e-3
+    assert along[-1] == pytest.approx(10.0, abs=0.01)
+    assert np.abs([theta - heading, rate]).max() < 1e-4 and np.abs(steer).max() < 1e-5
     matrix = vehicle.body_to_world
-    assert abs(matrix[2, 3]) < 1e-4 * car.wheelbase
-    np.testing.assert_allclose(matrix[:2, 3], (x, y))
+    np.testing.assert_allclose(matrix[:2, 3], (x[-1], y[-1]))
     assert matrix[2, 2] > 1 - 1e-8  # no pitch, no roll
     np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-9)
 
 
-@CARS
-def test_reset_starts_without_a_jump(car):
-    speed = 5.0 if car is CAR else 1.0
-    vehicle = moving(car, speed, period=mjcf_car.MAX_TIMESTEP)
-    heights, speeds = [], []
-    for _ in range(100):
-        vehicle.advance(0.0)
-        heights.append(vehicle.body_to_world[2, 3])
-        speeds.append(vehicle.state[3])
-    assert np.ptp(heights) < 1e-5 * car.wheelbase
-    assert np.abs(np.array(speeds) / speed - 1).max() < 2e-3
-    assert vehicle.state[0] == pytest.approx(speed * 0.2, rel=1e-3)
-
-
-def test_another_reset_forgets_the_drive_before():
-    vehicle = moving()
-    for _ in range(5):
-        vehicle.advance(0.4)
-    vehicle.reset(np.zeros(3), 5.0)
-    other = moving()
-    for _ in range(5):
-        vehicle.advance(0.1)
-        other.advance(0.1)
-    np.testing.assert_array_equal(vehicle.state, other.state)
+@pytest.mark.parametrize("steering", [None, SteeringAngle(CAR.max_steer)])
+def test_nothing_of_the_drive_before_and_no_control_beyond_the_limit_counts(steering):
+    again, other = MujocoVehicle(CAR, steering), MujocoVehicle(CAR, steering)
+    again.reset(np.ones(3), 3.0)
+    turn(again, 0.4, 5)
+    for vehicle in (again, other):
+        vehicle.reset(np.zeros(3), 5.0)
+    wild, limited = turn(again, 50.0, 10), turn(other, other.max_control, 10)
+    np.testing.assert_array_equal(wild, limited)
 
 
 @pytest.mark.parametrize("lag", [0.1, 0.3])
 def test_steering_follows_with_the_stated_lag(lag):
-    step = 0.006
-    handling = Handling(steer_time_constant=lag)
-    vehicle = moving(handling=handling, period=0.02)
-    for index in range(1, 40):
-        vehicle.advance(step)
-        expected = 1 - math.exp(-0.02 * index / lag)
-        # the servo after the lag and the rate limit before it take some milliseconds
-        assert vehicle.state[4] / step == pytest.approx(expected, abs=0.015 / lag)
+    vehicle = moving(handling=Handling(steer_time_constant=lag), period=0.02)
+    share = turn(vehicle, 0.006, 39)[:, 4] / 0.006
+    expected = 1 - np.exp(-0.02 * np.arange(1, 40) / lag)
+    # the servo after the lag and the rate limit before it take some milliseconds
+    np.testing.assert_allclose(share, expected, rtol=0, atol=0.015 / lag)
 
 
 def test_steering_rate_is_limited():
     handling = Handling(steer_time_constant=0.01, steer_rate=0.5)
     vehicle = moving(speed=1.0, handling=handling, period=0.02)
-    angles = []
-    for _ in range(40):
-        vehicle.advance(0.4)
-        angles.append(vehicle.state[4])
-    rates = np.diff(angles) / 0.02
+    rates = np.diff(turn(vehicle, 0.4, 40)[:, 4]) / 0.02
     assert rates.max() < 0.505
     assert rates[5:30].min() > 0.49
 
 
-@pytest.mark.parametrize("friction", [0.2, 0.5])
-def test_friction_limits_the_curvature(friction):
-    handling = Handling(friction=friction)
-    case = circle.Case("full-size car", 0.3, 8.0)
-    driven = circle.drive_circle(case, handling, share=0.6)
-    assert driven.demand > 1
+@pytest.mark.parametrize(
+    ("car", "speed", "friction"),
+    [(CAR, 8.0, 0.2), (CAR, 8.0, 0.5), (CAR, 10.0, None), (SMALL_CAR, 4.0, None)],
+)
+def test_friction_limits_the_curvature(car, speed, friction):
+    """At 0.3 rad each needs more friction than there is; None is the default."""
+    handling = Handling() if friction is None else Handling(friction=friction)
+    radius, most = car.wheelbase / math.tan(0.3), 9.81 * handling.friction
+    assert speed**2 / radius > most
+    error, states = drive_circle(car, 0.3, speed, share=0.6, handling=handling)
     # v^2 / R cannot exceed mu g, whatever the wheels are turned to
-    limit = driven.speed_ms**2 / (9.81 * friction)
-    assert driven.radius_m > 0.9 * limit
-    assert driven.error > 0.1
+    assert (1 + error) * radius > 0.9 * states[:, 3].mean() ** 2 / most
+    assert error > 0.1
 
 
 def test_slip_is_small_until_the_car_slides():
-    gripping, sliding = moving(speed=5.0), moving(speed=14.0)
-    for _ in range(20):
-        gripping.advance(0.3)
-        sliding.advance(0.3)
-    assert np.abs(gripping.slip_speeds).max() < 0.02
-    assert np.abs(sliding.slip_speeds).max() > 0.5
+    for speed, low, high in ((5.0, 0.0, 0.02), (14.0, 0.5, 20.0)):
+        vehicle = moving(speed=speed)
+        turn(vehicle, 0.3, 20)
+        assert low <= np.abs(vehicle.slip_speeds).max() < high
 
 
-@CARS
+@pytest.mark.parametrize("car", [CAR, SMALL_CAR], ids=["full", "small"])
 def test_wheels_meet_in_one_point(car):
-    steer = 0.9 * car.max_steer
     vehicle = moving(car, 0.1)
-    for _ in range(20):
-        vehicle.advance(steer)
-    data = vehicle._data
+    turn(vehicle, 0.9 * car.max_steer, 20)
     expected = ackermann_angles(car, vehicle.state[4])
     for name, angle in zip(mjcf_car.WHEELS[:2], expected, strict=True):
-        found = data.joint(f"{name}_steer").qpos[0]
+        found = vehicle._data.joint(f"{name}_steer").qpos[0]
         assert found == pytest.approx(float(angle), rel=0.01)
     left, right = (car.wheelbase / math.tan(float(angle)) for angle in expected)
     # the axes of both front wheels cross the rear axle's line at the same distance
     assert right - left == pytest.approx(car.track, rel=1e-9)
 
 
-def test_nothing_of_the_car_touches_itself():
+def test_nothing_of_the_car_touches_itself_and_its_mass_is_right():
     vehicle = moving(speed=1.0)
-    for _ in range(20):
-        vehicle.advance(0.7)
+    turn(vehicle, 0.7, 20)
     model, data = vehicle._model, vehicle._data
     assert data.ncon >= 3
     for contact in data.contact:
         names = {model.geom(int(geom)).name for geom in contact.geom}
         assert mjcf_car.GROUND in names
         assert len(names & set(mjcf_car.WHEELS)) == 1
-
-
-def test_control_beyond_the_limit_saturates():
-    wild, at_limit = moving(speed=2.0), moving(speed=2.0)
-    for _ in range(10):
-        wild.advance(50.0)
-        at_limit.advance(CAR.max_steer)
-    np.testing.assert_array_equal(wild.state, at_limit.state)
-
-
-def test_bad_input_is_refused():
-    with pytest.raises(InputError, match="no multiple of the physics timestep"):
-        MujocoVehicle(CAR, period=0.0333)
-    with pytest.raises(InputError, match="period"):
-        MujocoVehicle(CAR, period=0.0)
-    with pytest.raises(InputError, match="timestep: 0.01"):
-        MujocoVehicle(CAR, timestep=0.01)
-    # 2.7 m / tan(u) is half the track of 1.55 m at 1.291 rad
-    with pytest.raises(InputError, match="car.max_steer: 1.25 rad; .* than 1.241 rad"):
-        MujocoVehicle(replace(CAR, max_steer=1.25))
-    with pytest.raises(InputError, match="handling.friction"):
-        Handling(friction=0.0)
-    with pytest.raises(InputError, match="max_control"):
-        SteeringAngle(-1.0)
-    vehicle = MujocoVehicle(CAR)
-    with pytest.raises(InputError, match="after reset"):
-        vehicle.advance(0.0)
-    with pytest.raises(InputError, match="after reset"):
-        _ = vehicle.state
-    with pytest.raises(InputError, match="pose"):
-        vehicle.reset(np.array([0.0, math.nan, 0.0]), 5.0)
-    with pytest.raises(InputError, match="speed"):
-        vehicle.reset(np.zeros(3), math.inf)
-    vehicle.reset(np.zeros(3), 5.0)
-    with pytest.raises(InputError, match="control: nan"):
-        vehicle.advance(math.nan)
-
-
-def test_the_mass_is_the_cars():
-    model = MujocoVehicle(CAR)._model
     column = model.body(mjcf_car.COLUMN).mass[0]
     assert mujoco.mj_getTotalmass(model) - column == pytest.approx(CAR.mass)
+
+
+def started(pose=(0.0, 0.0, 0.0), speed=5.0, control=0.0):
+    def drive():
+        vehicle = MujocoVehicle(CAR)
+        vehicle.reset(np.array(pose), speed)
+        vehicle.advance(control)
+
+    return drive
+
+
+test_bad_input_is_refused = refusals(
+    (lambda: MujocoVehicle(CAR, period=0.0333), "physics timestep"),
+    (lambda: MujocoVehicle(CAR, period=0.0), "period"),
+    (lambda: MujocoVehicle(CAR, timestep=0.01), "timestep: 0.01"),
+    # 2.7 m / tan(u) is half the track of 1.55 m at 1.291 rad
+    (lambda: MujocoVehicle(replace(CAR, max_steer=1.25)), "car.max_steer: .* 1.241"),
+    (lambda: Handling(friction=0.0), "handling.friction"),
+    (lambda: SteeringAngle(-1.0), "max_control"),
+    (lambda: MujocoVehicle(CAR).advance(0.0), "after reset"),
+    (lambda: MujocoVehicle(CAR).state, "after reset"),
+    (started(pose=(0.0, math.nan, 0.0)), "pose"),
+    (started(speed=math.inf), "speed"),
+    (started(control=math.nan), "control: nan"),
+)

@@ -8,7 +8,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from helpers.recorded_drives import (
+from support.files.recordings import (
     CAMERA,
     COUNT,
     MOUNT,
@@ -17,18 +17,20 @@ from helpers.recorded_drives import (
     csv_rows,
     image_of,
     log_messages,
-    pose_message,
+    pose_of,
     quaternion,
+    stamped,
     write_csv_folder,
     write_drive_video,
     write_folder,
     write_log,
 )
-from helpers.small_fields import homogeneous
+from support.worlds.fields import homogeneous
 
 from mi_nerfattack.capture.pose_files import pose_matrix
 from mi_nerfattack.deploy.replay.environment import ReplayEnvironment, open_recording
-from mi_nerfattack.deploy.replay.recording import nearest_pose
+from mi_nerfattack.deploy.replay.mcap import McapTopics
+from mi_nerfattack.deploy.replay.recording import vehicle_states
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import Camera
@@ -60,7 +62,9 @@ def replay(path: Path, camera=CAMERA, period: float = 0.1) -> ReplayEnvironment:
     ],
 )
 def test_a_recording_is_shown_frame_by_frame(tmp_path, write, tolerance):
-    environment = replay(write(tmp_path))
+    path = write(tmp_path)
+    exact = 1e-5 if path.suffix == ".mcap" else 1e-9  # seconds since 1970 are rounded
+    environment = replay(path)
     frame = environment.reset(ROUTE, np.array([5.0, 5.0, 1.0]), seed=7)
     for index in range(COUNT):
         middle = frame.image[:, [1, 14]].astype(int)  # away from the edge of colours
@@ -68,13 +72,13 @@ def test_a_recording_is_shown_frame_by_frame(tmp_path, write, tolerance):
         assert abs(middle - wanted).max() <= tolerance
         assert frame.image.dtype == np.uint8 and frame.depth.dtype == np.float32
         assert np.isposinf(frame.depth).all() and frame.depth.shape == (8, 16)
-        np.testing.assert_allclose(frame.camera_to_world, POSES[index], atol=1e-9)
-        np.testing.assert_allclose(environment.state, STATES[index], atol=1e-9)
+        np.testing.assert_allclose(frame.camera_to_world, POSES[index], atol=exact)
+        np.testing.assert_allclose(environment.state, STATES[index], atol=exact)
         assert environment.is_over == (index == COUNT - 1)
         if not environment.is_over:
             frame = environment.step(0.1 * index)
     assert environment.controls == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
-    with pytest.raises(InputError, match="the recording is over after 5 steps"):
+    with pytest.raises(InputError, match="over after 5 steps"):
         environment.step(0.0)
     frame = environment.reset(ROUTE)
     assert abs(frame.image[:, 1].astype(int) - image_of(0)[:, 1]).max() <= tolerance
@@ -95,16 +99,17 @@ def test_frames_are_picked_by_the_period(tmp_path):
     np.testing.assert_allclose(seen, [0.0, 1.5, 2.5])
 
 
-def test_depth_of_capture_is_read_and_unknown_depth_is_far(tmp_path):
-    environment = replay(write_folder(tmp_path / "frames", depth=True))
-    depth = environment.reset(ROUTE).depth
-    assert np.isposinf(depth[:2]).all() and (depth[2:] == 3.0).all()
-
-
 @pytest.mark.parametrize(("with_depth", "is_seen"), [(True, False), (False, True)])
 def test_objects_are_behind_recorded_depth_alone(tmp_path, with_depth, is_seen):
     environment = replay(write_folder(tmp_path / "frames", depth=with_depth))
+    for use in (lambda: environment.step(0.0), lambda: environment.state):
+        with pytest.raises(InputError, match="after reset"):
+            use()
     plain = environment.reset(ROUTE)
+    with pytest.raises(InputError, match="control: nan"):
+        environment.step(math.nan)
+    assert np.isposinf(plain.depth[:2]).all()  # of capture: unknown
+    assert (plain.depth[2:] == (3.0 if with_depth else np.inf)).all()
     ahead = POSES[0][:3, 3] + 6 * POSES[0][:3, 2]
     ball = PosedField(homogeneous(20.0), Pose.upright(tuple(ahead), 0.0, 2.0))
     environment.show([ball])
@@ -118,12 +123,12 @@ def test_objects_are_behind_recorded_depth_alone(tmp_path, with_depth, is_seen):
 
 def test_toml_poses_of_the_camera_and_its_intrinsics(tmp_path):
     write_csv_folder(tmp_path / "frames").joinpath("poses.csv").unlink()
-    lines = ["[camera]", "width = 16", "height = 8", "fx = 8.0", "fy = 8.0"]
-    lines += ["cx = 8.0", "cy = 4.0"]
+    lines = "[camera] width=16 height=8 fx=8.0 fy=8.0 cx=8.0 cy=4.0".split()
     for i, matrix in enumerate(POSES):
-        q = {f"q{k}": v for k, v in quaternion(matrix).items()}
-        row = dict(zip(("x_m", "y_m", "z_m"), matrix[:3, 3].tolist(), strict=True)) | q
         lines += ["[[frames]]", f"time_s = {i / 10}", f'file = "{i}.png"']
+        x, y, z = matrix[:3, 3].tolist()
+        row = {"x_m": x, "y_m": y, "z_m": z}
+        row |= {f"q{name}": value for name, value in quaternion(matrix).items()}
         lines += [f"{key} = {value!r}" for key, value in row.items()]
     files.write_text(tmp_path / "frames" / "poses.toml", "\n".join(lines))
     recording = open_recording(tmp_path / "frames", None, MOUNT)
@@ -131,41 +136,35 @@ def test_toml_poses_of_the_camera_and_its_intrinsics(tmp_path):
     np.testing.assert_allclose(recording.track.camera_to_world, POSES, atol=1e-12)
 
 
-def test_a_log_of_vehicle_poses(tmp_path):
-    topics = log_messages(tmp_path)
-    start = 1.77e9
-    poses = []
-    for i, (x, y, theta) in enumerate(STATES):
-        turn = pose_matrix(
-            "", (x, y, 0), (math.cos(theta / 2), 0, 0, math.sin(theta / 2))
-        )
-        poses.append(pose_message(start + 0.1 * i, turn))
-    del topics["/camera/pose"]
-    topics["/vehicle/pose"] = ("foxglove.PoseInFrame", poses)
-    path = write_log(tmp_path / "drive.mcap", topics, "LZ4")
-    recording = open_recording(path, None, MOUNT)
-    np.testing.assert_allclose(recording.track.camera_to_world, POSES, atol=1e-9)
-    assert_same_camera(recording.camera)  # K counts from the first pixel's centre
-
-
-def test_quaternions_turn_as_they_should():
-    # a quarter about z takes x to y
-    half = math.sqrt(0.5)
-    matrix = pose_matrix("", (1, 2, 3), (half, 0, 0, half))
-    np.testing.assert_allclose(matrix @ [1, 0, 0, 1], [1, 3, 3, 1], atol=1e-12)
-    # a third about (1, 1, 1) takes x to y, y to z
-    matrix = pose_matrix("", (0, 0, 0), (0.5, 0.5, 0.5, 0.5))
-    np.testing.assert_allclose(matrix[:3, :3] @ np.eye(3)[:, :2], np.eye(3)[:, 1:])
-
-
-def test_video_poses_with_times_go_to_the_nearest_frame(tmp_path):
-    path = write_drive_video(tmp_path, table=False)
-    rows = [f"{0.1 * i + 0.02},{x},{y},{t}" for i, (x, y, t) in enumerate(STATES)]
-    rows.insert(3, "0.26,9,9,0")  # between two frames, nearer to none
-    files.write_text(
-        tmp_path / "drive.csv", "\n".join(["time_s,x_m,y_m,heading_rad", *rows])
-    )
-    recording = open_recording(path, CAMERA, MOUNT)
+def test_a_log_of_somebody_else(tmp_path):
+    """Raw images, odometry, other names; two cameras need a choice."""
+    images, odometry = [], []
+    for i, state in enumerate(STATES):
+        pixels = image_of(i)[..., ::-1]
+        rows = np.zeros((8, 50), np.uint8)  # with two bytes of padding
+        rows[:, :48] = pixels.reshape(8, 48)
+        raw = {"height": 8, "width": 16, "encoding": "bgr8", "is_bigendian": 0}
+        head = stamped(100.0 + 0.1 * i)
+        images.append({**head, **raw, "step": 50, "data": rows.tobytes()})
+        turn = (math.cos(state[2] / 2), 0, 0, math.sin(state[2] / 2))
+        matrix = pose_matrix("", (*state[:2], 0), turn)
+        still = {name: dict.fromkeys("xyz", 0.0) for name in ("linear", "angular")}
+        none = {"covariance": [0.0] * 36}
+        pose = {"pose": pose_of(matrix), **none}
+        child = {"child_frame_id": "base_link", "twist": {"twist": still, **none}}
+        odometry.append({**head, **child, "pose": pose})
+    topics = {
+        "/front/image_raw": ("sensor_msgs/Image", images),
+        "/back/image_raw": ("sensor_msgs/Image", images[::-1]),
+        "/odom": ("nav_msgs/Odometry", odometry),
+        "/safety": ("rcl_interfaces/Log", []),
+    }
+    path = write_log(tmp_path / "other.mcap", topics)
+    with pytest.raises(InputError, match="/front/image_raw, /back/.*--topics image="):
+        open_recording(path, CAMERA, MOUNT)
+    chosen = McapTopics.parse(["image=/front/image_raw"])
+    recording = open_recording(path, CAMERA, MOUNT, topics=chosen)
+    np.testing.assert_array_equal(recording.image(3), image_of(3))
     np.testing.assert_allclose(recording.track.camera_to_world, POSES, atol=1e-12)
 
 
@@ -189,16 +188,13 @@ def test_frames_that_a_cut_keeps_but_hides_do_not_count(tmp_path):
         assert abs(recording.image(index)[:, 1] - wanted).max() <= 6
 
 
-def test_nearest_pose_of_one_pose():
-    assert nearest_pose("f", "p", np.array([1.0]), np.array([1.01])).tolist() == [0]
-
-
-def test_step_comes_after_reset(tmp_path):
-    environment = replay(write_folder(tmp_path / "frames"))
-    with pytest.raises(InputError, match="step comes after reset"):
-        environment.step(0.0)
-    with pytest.raises(InputError, match="state only after reset"):
-        _ = environment.state
-    environment.reset(ROUTE)
-    with pytest.raises(InputError, match="control: nan"):
-        environment.step(math.nan)
+def test_one_late_frame_does_not_refuse_a_log(tmp_path):
+    topics = log_messages(tmp_path)
+    late = stamped(1.77e9 + 0.296)  # 4 ms before the next, which the poses are not
+    topics["/camera/image"][1][2].update(late)
+    recording = open_recording(write_log(tmp_path / "d.mcap", topics), None, MOUNT)
+    assert_same_camera(recording.camera)  # K counts from the first pixel's centre
+    x = vehicle_states(recording.track, MOUNT)[:, 0]  # 5 m/s, poses 10 ms late
+    np.testing.assert_allclose(
+        x, 5 * np.array([0, 0.1, 0.296, 0.3, 0.4, 0.5]), atol=1e-5
+    )

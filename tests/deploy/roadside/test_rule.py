@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers.roadside import (
+from support.faults.refusals import refusals
+from support.worlds.places import (
     KERB_M,
     bent,
     kerb_scene,
@@ -16,24 +18,75 @@ from helpers.roadside import (
     straight,
     surroundings,
 )
-from helpers.standing_places import Judge, solid_box
 
-from mi_nerfattack.deploy.place import bundled_place
+from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.deploy.roadside.footprint import Shape, Stands
 from mi_nerfattack.deploy.roadside.rule import Roadside
 from mi_nerfattack.deploy.roadside.surroundings import Surroundings
-from mi_nerfattack.deploy.roadside.view import project
-from mi_nerfattack.deploy.sites import PlaceSite
-from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields.grid import GridField, GridLayout
-from mi_nerfattack.fields.io import load_grid
-from mi_nerfattack.fields.occupancy import Occupancy
-from mi_nerfattack.render.camera.intrinsics import (
-    from_fov,
-    generate_rays,
-    pose_arrays,
+from mi_nerfattack.experiment.checks.standing import (
+    Solid,
+    lane_findings,
+    meeting_findings,
+    scene_findings,
 )
+from mi_nerfattack.fields.grid import GridField, GridLayout
+from mi_nerfattack.fields.occupancy import Occupancy
+from mi_nerfattack.render.camera.intrinsics import mount_matrix
+from mi_nerfattack.render.camera.lens import generate_rays, pose_arrays
+from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.vehicle.route.route import Route
+
+
+def solid_box(length: float, width: float, height: float) -> GridField:
+    half = np.array([length, width]) / 2
+    lower, upper = np.array([*-half, 0.0]), np.array([*half, height])
+    return GridField(GridLayout(3, 5, 12), lower, upper, density_scale=60.0)
+
+
+@dataclass(eq=False)
+class Judge:
+    """Looks at the objects of a drive along a route from 0 to `end`, metres."""
+
+    around: Surroundings
+    route: Route
+    end: float
+
+    def findings(self, fields: Sequence[GridField], poses: Sequence[Pose]) -> list[str]:
+        pairs = enumerate(zip(fields, poses, strict=True))
+        solids = [Solid.of(f"{i}", PosedField(*pair)) for i, pair in pairs]
+        found = list(meeting_findings(solids))
+        for route in self.around.routes:  # as if a car were as wide as the lane
+            found += lane_findings(solids, route, route.lane_width_m, Freedom())
+        scene = self.around.scene
+        return found + list(scene_findings(solids, self.route, scene, "scene"))
+
+    def seconds(self, fields: Sequence[GridField], poses: Sequence[Pose], px: int):
+        """Return how long each object shows at least so many pixels, seconds."""
+        pairs = enumerate(zip(fields, poses, strict=True))
+        boxes = {f"o{i}": box_of(*pair) for i, pair in pairs}
+        scene = mi.load_dict({"type": "scene", **boxes}, parallel=False)
+        arc = np.arange(0, self.end + 1e-6, self.route.speed_ms * self.around.period)
+        cameras = mount_matrix(self.route.pose_at(arc), self.around.mount)
+        rays = generate_rays(self.around.camera, *pose_arrays(cameras), len(arc))
+        ray = mi.Ray3f(*rays)
+        behind = self.around.scene.ray_intersect_preliminary(ray, coherent=True).t
+        hit = scene.ray_intersect_preliminary(ray, coherent=True)
+        shown = [
+            (hit.shape == mi.ShapePtr(shape)) & (hit.t < behind)
+            for shape in sorted(scene.shapes(), key=lambda shape: shape.id())
+        ]
+        counts = [item.numpy().reshape(len(arc), -1).sum(1) for item in shown]
+        return self.around.period * (np.array(counts) >= px).sum(1)
+
+
+def box_of(field: GridField, pose: Pose) -> dict:
+    matrix = np.eye(4)
+    matrix[:3, :3] = pose.scale * pose.rotation * (field.upper - field.lower) / 2
+    middle = pose.scale * pose.rotation @ (field.upper + field.lower) / 2
+    matrix[:3, 3] = pose.translation + middle
+    return {"type": "cube", "to_world": mi.ScalarTransform4f(matrix)}
+
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -46,34 +99,27 @@ def draw(fields, around: Surroundings, seed=0, rule=None, route=None):
     return rule.draw(fields, around, route, DRIVE, np.random.default_rng(seed))
 
 
-def stands(*rows, shape=None) -> Stands:
-    """Boxes of x, y, yaw; 4 m long, 2 m wide, 1 m high."""
-    shape = shape or Shape.of(solid_box(4.0, 2.0, 1.0))
-    x, y, yaw = np.array(rows, float).T
-    ones = np.ones(len(rows))
-    return Stands(shape, np.stack([x, y], -1), 0 * ones, yaw, ones)
-
-
 def test_the_footprint_is_the_occupied_box():
     """Cells 2 to 4 of 8 along x, all along y, 0 to 3 of 8 along z."""
     cells = np.zeros((8, 8, 8), bool)
     cells[2:5, :, :4] = True
-    field = GridField(
-        GridLayout(3, 5, 12), np.array([-4.0, -1, 0]), np.array([4.0, 1, 8])
-    )
+    lower, upper = np.array([-4.0, -1, 0]), np.array([4.0, 1, 8])
+    field = GridField(GridLayout(3, 5, 12), lower, upper)
     field.occupy(Occupancy(cells))
     shape = Shape.of(field)
-    np.testing.assert_allclose(shape.lower, [-2, -1, 0])
-    np.testing.assert_allclose(shape.upper, [1, 1, 4])
+    np.testing.assert_allclose([shape.lower, shape.upper], [[-2, -1, 0], [1, 1, 4]])
     assert shape.is_long and not Shape.of(small_grid()).is_long
-    inside = (shape.points >= shape.lower) & (shape.points <= shape.upper)
-    assert inside.all()
     # its pose puts the middle of what is occupied on the place
     placed = Stands(shape, *(np.array([v]) for v in ([5.0, 6.0], 0.1, np.pi / 2, 2.0)))
     pose = placed.pose(0)
     middle = 2 * pose.rotation @ [-0.5, 0, 0] + pose.translation
     np.testing.assert_allclose(middle, [5, 6, 0.1], atol=1e-12)
-    np.testing.assert_allclose(placed.body()[0].mean(0)[:2], [5, 6], atol=1)
+
+
+def stands(x: float, y: float, yaw: float) -> Stands:
+    """A box 4 m long, 2 m wide, 1 m high."""
+    shape = Shape.of(solid_box(4.0, 2.0, 1.0))
+    return Stands(shape, np.array([[x, y]]), np.zeros(1), np.array([yaw]), np.ones(1))
 
 
 @pytest.mark.parametrize(
@@ -81,46 +127,22 @@ def test_the_footprint_is_the_occupied_box():
     [
         ((0.0, 2.4, 0.0), True),  # 0.4 m between the long sides
         ((0.0, 2.2, 0.0), False),
-        ((4.4, 0.0, 0.0), True),
         ((3.2, 0.0, np.pi / 2), False),  # 0.2 m
         ((3.4, 0.0, np.pi / 2), True),
         ((4.2, -0.8, np.pi / 4), True),  # only an axis of the other box tells
     ],
 )
 def test_boxes_are_apart_by_their_sides(other, apart):
-    assert stands(other).apart(stands((0, 0, 0)), 0.3)[0] == apart
-    assert stands((0, 0, 0)).apart(stands(other), 0.3)[0] == apart
+    assert stands(*other).apart(stands(0, 0, 0), 0.3)[0] == apart
+    assert stands(0, 0, 0).apart(stands(*other), 0.3)[0] == apart
 
 
-def test_boxes_hide_what_is_behind_them():
-    """The box reaches from -2 to 2 along x and is 1 m high; seen from 10 m before."""
-    eye = np.tile([-10.0, 0.0, 0.5], (5, 1))
-    points = np.array(
-        [[5, 0, 0.5], [5, 0, 3.0], [5, 3, 0.5], [-3, 0, 0.5], [-20, 0, 0.5]], float
-    )
-    hidden = stands((0, 0, 0)).hides(eye, points)
-    assert hidden.tolist() == [True, False, False, False, False]
-    turned = stands((0, 0, np.pi / 2)).hides(eye, np.array([[5.0, 2.5, 0.5]] * 5))
-    assert turned.all()  # 4 m wide across the view
-
-
-def test_points_are_where_a_lens_shows_them():
-    """Along the ray of each pixel's centre; far outside, where the lens folds, none."""
-    camera = replace(from_fov(40, 20, 90.0), k1=-0.1, p1=0.005)
-    rays = generate_rays(camera, *pose_arrays(np.eye(4)[None]), 1)[1].numpy().T
-    image, inside = project(camera, 7.0 * rays)
-    assert inside.all()
-    u, v = np.meshgrid(np.arange(40) + 0.5, np.arange(20) + 0.5)
-    np.testing.assert_allclose(image, np.stack([u, v], -1).reshape(-1, 2), atol=1e-3)
-    outside = np.array([[2.8, 0, 1], [0, 1, 1], [0.1, 0.1, -1]], float)
-    assert not project(camera, outside)[1].any()
-
-
-def test_an_object_without_matter_is_refused():
-    field = small_grid()
-    field.occupy(Occupancy(np.zeros((4, 4, 4), bool)))
-    with pytest.raises(InputError, match="no cell of its field is occupied"):
-        draw([field], kerbed())
+def test_a_turned_box_hides_what_is_behind_it():
+    """Along y = 1.2 it reaches from x = -0.21 to 1.63."""
+    eyes = np.tile([-10.0, 1.2, 0.5], (3, 1))
+    points = np.array([[-0.8, 1.2, 0.5], [0.5, 1.2, 0.5], [5.0, 1.2, 3.5]])
+    hidden = stands(0, 0, np.pi / 4).hides(eyes, points)
+    assert hidden.tolist() == [False, True, False]
 
 
 def kerbed() -> Surroundings:
@@ -130,6 +152,9 @@ def kerbed() -> Surroundings:
 
 def test_things_stand_beyond_the_kerb_and_cars_along_it():
     around = kerbed()
+    points = np.array([[0.0, 0.0], [0.0, 10.0], [20.0, 0.0], [200.0, 0.0]])
+    height = around.height(points)  # the highest of what is low
+    np.testing.assert_allclose(height, [0, KERB_M, np.nan, np.nan], atol=1e-5)
     car, post = solid_box(4.2, 1.8, 1.5), small_grid()
     yaws = []
     for seed in range(6):
@@ -143,32 +168,8 @@ def test_things_stand_beyond_the_kerb_and_cars_along_it():
             assert pose.scale == 1
         yaws.append(np.arctan2(second.rotation[1, 0], second.rotation[0, 0]))
     assert np.std(yaws) > 1  # posts stand at any angle
-
-
-def test_draws_follow_the_seed_alone():
-    around, fields = kerbed(), [small_grid(), solid_box(1, 1, 1)]
-    one, other, more = (draw(fields, around, seed) for seed in (3, 3, 4))
-    for a, b in zip(one, other, strict=True):
-        np.testing.assert_array_equal(a.translation, b.translation)
-    assert not np.array_equal(one[0].translation, more[0].translation)
-
-
-def test_scales_belong_to_kinds_and_repeat():
-    rule = Roadside(((1.0, 1.0), (2.0, 3.0)))
-    arguments = (straight(), DRIVE, np.random.default_rng(0))
-    fields = [small_grid() for _ in range(3)]
-    around = surroundings(straight())
-    scales = [p.scale for p in rule.draw(fields, around, *arguments, [1, 2, 3])]
-    assert scales[1] == 1 and 2 <= scales[0] <= 3 and 2 <= scales[2] <= 3
-
-
-def test_lanes_of_all_routes_stay_free():
-    """A route to the left of the driven one leaves the right side alone."""
-    beside = Route("beside", 0, np.array([[0.0, 4.0], [40.0, 4.0]]), 5.0)
-    around = surroundings(straight(), beside)
-    for seed in range(6):
-        (pose,) = draw([small_grid()], around, seed)
-        assert not -1.75 < pose.translation[1] < 6.5
+    again = draw([car, post], around, 5)  # the seed alone decides
+    np.testing.assert_array_equal(again[1].translation, second.translation)
 
 
 @pytest.mark.parametrize(
@@ -177,7 +178,6 @@ def test_lanes_of_all_routes_stay_free():
     ids=["straight, natural", "left, sizes"],
 )
 def test_another_method_finds_nothing_wrong(route, rule):
-    """Six objects beside a wall, on a bend and a straight."""
     around = surroundings(route, scene=kerb_scene())
     judge = Judge(around, route, route.length - 2)
     fields = [solid_box(4.2, 1.8, 1.5), solid_box(1, 1, 1)]
@@ -201,71 +201,54 @@ def test_the_other_method_finds_what_is_wrong():
     assert judge.seconds([grid], [pose], 10) >= 1 > judge.seconds([grid], [far], 10)
 
 
-def test_what_stands_behind_a_wall_is_not_seen():
-    """A wall 4 m long before the only free ground hides all there is."""
-    wall = mi.ScalarTransform4f().translate([25, 3.2, 5]).scale([30, 0.05, 5])
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "road": plate(0.0, 25.0, 26.8),
-            "wall": {"type": "cube", "to_world": wall},
-        },
-        parallel=False,
-    )
-    around = surroundings(straight(), scene=scene)
-    rule = Roadside(gap_m=(2.0, 2.5))
-    with pytest.raises(InputError, match="'straight': places for 0 of 1.* 0.0 to 38.0"):
-        draw([small_grid()], around, rule=rule)
+def test_scales_belong_to_kinds_and_lanes_of_all_routes_stay_free():
+    """A route to the left of the driven one leaves the right side alone."""
+    beside = Route("beside", 0, np.array([[0.0, 4.0], [40.0, 4.0]]), 5.0)
+    around, rule = surroundings(straight(), beside), Roadside(((1.0, 1.0), (2.0, 3.0)))
+    fields = [small_grid() for _ in range(3)]
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        poses = rule.draw(fields, around, straight(), DRIVE, rng, [1, 2, 3])
+        assert poses[1].scale == 1 and 2 <= poses[0].scale <= 3
+        assert not any(-1.75 < pose.translation[1] < 6.5 for pose in poses)
 
 
-def test_nothing_stands_without_ground_and_some_find_room(rng):
+def test_many_find_some_room(rng):
     """On 4.25 m beside the lane there is room for some boxes 2 m wide, not for 16."""
-    scene = mi.load_dict({"type": "scene", "road": plate(0.0, 0.0, 6.0)})
-    around = surroundings(straight(), scene=scene)
-    with pytest.raises(InputError, match="ask for fewer or other sizes"):
-        draw([solid_box(9.0, 9.0, 3.0)], around)
-    boxes = 16 * [solid_box(2.0, 2.0, 1.0)]
+    around, boxes = surroundings(straight(), scene=narrow()), [solid_box(2, 2, 1)] * 16
     found = Roadside().find(boxes, around, straight(), (0.0, 6.0), rng)
     assert 0 < sum(pose is not None for pose in found) < 16
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"scales": ()}, "Roadside.scales: none"),
-        ({"scales": ((2.0, 1.0),)}, "2.0 to 1.0; the smaller comes first"),
-        ({"view_px": 0}, "view_px: 0; must be a whole number"),
-        ({"clearance_m": -1.0}, "clearance_m: -1.0; must be a finite number"),
-    ],
+def empty() -> GridField:
+    field = small_grid()
+    field.occupy(Occupancy(np.zeros((4, 4, 4), bool)))
+    return field
+
+
+def walled() -> mi.Scene:
+    to_world = mi.ScalarTransform4f().translate([25, 3.2, 5]).scale([30, 0.05, 5])
+    wall = {"type": "cube", "to_world": to_world}
+    scene = {"type": "scene", "road": plate(0.0, 25.0, 26.8), "wall": wall}
+    return mi.load_dict(scene, parallel=False)
+
+
+def stood(make, scene=kerb_scene, **rule):
+    def call():
+        draw([make()], surroundings(straight(), scene=scene()), rule=Roadside(**rule))
+
+    return call
+
+
+def narrow() -> mi.Scene:
+    return mi.load_dict({"type": "scene", "road": plate(0.0, 0.0, 6.0)})
+
+
+test_no_room_and_rules_out_of_range_are_refused = refusals(
+    (stood(empty), "no cell of its field"),
+    (stood(lambda: solid_box(9.0, 9.0, 3.0), narrow), "fewer or other sizes"),
+    (stood(small_grid, walled, gap_m=(2.0, 2.5)), "'straight': .* 0 of 1.* 0.0 to 38"),
+    (lambda: Roadside(scales=()), "Roadside.scales: none"),
+    (lambda: Roadside(scales=((2.0, 1.0),)), "Roadside: 2.0 to 1.0"),
+    (lambda: Roadside(view_px=0), "view_px: 0"),
 )
-def test_a_rule_out_of_range_is_refused(change, message):
-    with pytest.raises(InputError, match=message):
-        Roadside(**change)
-
-
-def test_ground_is_the_highest_low_surface():
-    points = np.array([[0.0, 0.0], [0.0, 10.0], [20.0, 0.0], [200.0, 0.0]])
-    height = kerbed().height(points)
-    np.testing.assert_allclose(height, [0, KERB_M, np.nan, np.nan], atol=1e-5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("index", range(3))
-def test_sixty_draws_beside_each_bundled_route(index):
-    """Mixed numbers and kinds; none on a lane, in a wall, in another or unseen."""
-    place = bundled_place()
-    around = PlaceSite("mitsuba", place).load_surroundings()
-    route = around.routes[index]
-    judge = Judge(around, route, route.length - 2)
-    kinds = [solid_box(4.2, 1.8, 1.5), solid_box(1, 1, 1), load_grid(place.objects[0])]
-    rule, least = Roadside(((1.0, 1.0), (0.5, 1.5), (1.0, 3.3))), []
-    for seed in range(60):
-        rng, count = np.random.default_rng([19, index, seed]), 1 + seed % 6
-        numbers = sorted(rng.integers(3, size=count).tolist())
-        fields = [kinds[number] for number in numbers]
-        stretch = (0.0, route.length - 2)
-        poses = rule.draw(fields, around, route, stretch, rng, numbers)
-        assert judge.findings(fields, poses) == [], seed
-        least.append(judge.seconds(fields, poses, 10).min())
-    print(f"{route.name}: {min(least):.1f} s at least in view")
-    assert min(least) >= 0.95

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.kernels import nothing_compiled
-from helpers.small_fields import homogeneous, sigmoid_to_linear
+from support.faults.refusals import refusals
+from support.reference.derivatives import nothing_compiled
+from support.worlds.fields import homogeneous, sigmoid_to_linear
 
 from mi_nerfattack.deploy import CameraFrame
 from mi_nerfattack.deploy.views.paste import Paster
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import from_fov, look_at
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
@@ -20,30 +20,32 @@ CAMERA = from_fov(16, 12, 60.0)
 GREY = 90
 
 
-def directions() -> np.ndarray:
-    """Return unit vectors (12, 16, 3) through the pixels, in the camera's frame."""
+def box_interval(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where rays (12, 16) enter and leave the box [-1, 1]^3, metres."""
     x = (np.arange(16) + 0.5 - CAMERA.cx) / CAMERA.fx
     y = (np.arange(12) + 0.5 - CAMERA.cy) / CAMERA.fy
     rays = np.stack([*np.meshgrid(x, y), np.ones((12, 16))], axis=-1)
-    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-
-
-def box_interval(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where rays (12, 16) enter and leave the box [-1, 1]^3, metres."""
-    towards = directions() @ pose[:3, :3].T
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    towards = rays @ pose[:3, :3].T
     with np.errstate(divide="ignore"):
         a, b = ((side - pose[:3, 3]) / towards for side in (-1.0, 1.0))
-    near, far = np.minimum(a, b).max(-1), np.maximum(a, b).min(-1)
-    return near, far
+    return np.minimum(a, b).max(-1), np.maximum(a, b).min(-1)
+
+
+AHEAD = look_at((-8.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+def pasted(depth: float, *objects: PosedField, pose=AHEAD) -> CameraFrame:
+    return Paster(CAMERA, objects).paste(frame_at(pose, depth))
+
+
+def posed(density, raw=0.0, x=0.0, scale=1.0) -> PosedField:
+    return PosedField(homogeneous(density, raw), Pose.upright((x, 0, 0), 0.0, scale))
 
 
 def frame_at(pose: np.ndarray, depth: float) -> CameraFrame:
     image = np.full((12, 16, 3), GREY, np.uint8)
     return CameraFrame(image, np.full((12, 16), depth, np.float32), pose)
-
-
-def paste_objects(frame: CameraFrame, camera, objects) -> CameraFrame:
-    return Paster(camera, objects).paste(frame)
 
 
 def rolled(pose: np.ndarray, angle: float) -> np.ndarray:
@@ -58,9 +60,7 @@ def rolled(pose: np.ndarray, angle: float) -> np.ndarray:
 def test_near_box_covers_what_lies_behind(wall, angle):
     density, raw = 30.0, 0.4
     pose = rolled(look_at((-4.0, 0.7, 0.3), (0.0, 0.2, 0.0)), angle)
-    objects = [PosedField(homogeneous(density, raw))]
-    frame = frame_at(pose, wall)
-    found = paste_objects(frame, CAMERA, objects)
+    found = pasted(wall, posed(density, raw), pose=pose)
     near, far = box_interval(pose)
     inside, outside = far - near > 0.2, far - near < 0
     assert inside.sum() > 20 and outside.sum() > 20
@@ -73,62 +73,38 @@ def test_near_box_covers_what_lies_behind(wall, angle):
     expected = near + 1 / density - length * passed / (1 - passed)
     assert abs(found.depth - expected)[inside].max() < 2e-3
     assert found.depth.dtype == np.float32 and found.image.dtype == np.uint8
-    assert (frame.image == GREY).all()
-
-
-def test_wall_in_front_hides_the_box():
-    pose = look_at((-4.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    frame = frame_at(pose, 2.0)
-    found = paste_objects(frame, CAMERA, [PosedField(homogeneous(30.0))])
-    assert (found.image == frame.image).all()
-    assert (found.depth == frame.depth).all()
 
 
 @pytest.mark.parametrize(("length", "is_pasted"), [(0.6, False), (0.8, True)])
-def test_half_opacity_decides(length, is_pasted):
+def test_half_opacity_decides_and_walls_hide(length, is_pasted):
     # 1 - exp(-x) passes one half at x = 0.69; along the axis the box is 2 m thick
     pose = look_at((-4.0, 1e-3, 1e-3), (0.0, 1e-3, 1e-3))
-    frame = frame_at(pose, np.inf)
-    found = paste_objects(frame, CAMERA, [PosedField(homogeneous(length / 2))])
+    found = pasted(np.inf, posed(length / 2), pose=pose)
     assert np.isfinite(found.depth[5:7, 7:9]).all() == is_pasted
-
-
-def test_object_behind_the_camera_is_not_seen():
-    pose = look_at((4.0, 0.0, 0.0), (8.0, 0.0, 0.0))
-    found = paste_objects(frame_at(pose, np.inf), CAMERA, [PosedField(homogeneous())])
-    assert np.isinf(found.depth).all()
-
-
-def test_nearer_of_two_objects_is_on_top():
-    pose = look_at((-8.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    front = Pose.upright((-3.0, 0.0, 0.0), 0.0, 0.5)
-    objects = [PosedField(homogeneous(60, 3.0)), PosedField(homogeneous(60, -3), front)]
-    found = paste_objects(frame_at(pose, np.inf), CAMERA, objects)
-    assert found.image[6, 8].max() < 100
-    assert found.depth[6, 8] == pytest.approx(4.5, abs=0.05)
+    behind = look_at((4.0, 0.0, 0.0), (8.0, 0.0, 0.0))
+    for at in (pose, behind):
+        hidden = pasted(2.0, posed(30.0), pose=at)
+        assert (hidden.image == GREY).all() and (hidden.depth == 2.0).all()
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_wall_between_two_objects_shows_no_outline_of_the_nearer(order):
-    # near: thin, so that half of a ray passes it; far: behind the wall
-    pose = look_at((-8.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    near = PosedField(homogeneous(0.25, 3.0), Pose.upright((-4.0, 0.0, 0.0), 0.0, 0.5))
-    far = PosedField(homogeneous(60, -3.0), Pose.upright((2.0, 0.0, 0.0), 0.0, 2.0))
-    frame = frame_at(pose, 7.0)
-    for item in (near, far):
-        assert (paste_objects(frame, CAMERA, [item]).image == GREY).all()
-    found = paste_objects(frame, CAMERA, [near, far][::order])
-    assert (found.image == GREY).all() and (found.depth == 7.0).all()
+def test_walls_among_objects(order):
+    """Near: thin, so that half of a ray passes it. Far: behind the wall at 7 m."""
+    near, far = posed(0.25, 3.0, -4.0, 0.5), posed(60, -3.0, 2.0, 2.0)
+    for items in ([near], [far], [near, far][::order]):
+        found = pasted(7.0, *items)
+        assert (found.image == GREY).all() and (found.depth == 7.0).all()
+    dark = posed(60, -3.0, -3.0, 0.5)
+    found = pasted(np.inf, *[posed(60, 3.0), dark][::order])
+    assert found.image[6, 8].max() < 100  # the nearer one is on top
+    assert found.depth[6, 8] == pytest.approx(4.5, abs=0.05)
 
 
 def test_wall_between_two_objects_hides_the_farther_alone():
-    pose = look_at((-8.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    near = PosedField(homogeneous(2.0, 3.0), Pose.upright((-4.0, 0.0, 0.0), 0.0, 0.5))
-    far = PosedField(homogeneous(60, -3.0), Pose.upright((2.0, 0.0, 0.0), 0.0, 2.0))
-    frame = frame_at(pose, 7.0)
-    alone = paste_objects(frame, CAMERA, [near])
+    near, far = posed(2.0, 3.0, -4.0, 0.5), posed(60, -3.0, 2.0, 2.0)
+    alone = pasted(7.0, near)
     assert (alone.depth < 7).sum() > 3
-    found = paste_objects(frame, CAMERA, [far, near])
+    found = pasted(7.0, far, near)
     assert (found.image == alone.image).all() and (found.depth == alone.depth).all()
     layers = found.layers(["far", "near"])
     assert not layers["far"].any() and np.isinf(layers["far.Z"]).all()
@@ -140,29 +116,28 @@ def test_wall_between_two_objects_hides_the_farther_alone():
 
 
 def test_no_kernel_is_compiled_after_the_first_frame():
-    posed = PosedField(homogeneous(30.0))
-    paster = Paster(CAMERA, [posed])
+    item = posed(30.0)
+    paster = Paster(CAMERA, [item])
     first = paster.paste(frame_at(look_at((-4, 0, 0), (0, 0, 0)), np.inf))
     with nothing_compiled():
-        texture = posed.field.texture.numpy() - 1.0
-        posed.field.set_parameter("texture", texture)
-        posed.move(np.array([0.3, 0.1, 0.0, 0, 0, 0]))
+        item.field.set_parameter("texture", item.field.texture.numpy() - 1.0)
+        item.move(np.array([0.3, 0.1, 0.0, 0, 0, 0]))
         second = paster.paste(frame_at(look_at((-5, 1, 0.5), (0, 0, 0)), np.inf))
     assert second.image[6, 8].max() < first.image[6, 8].min() - 20
 
 
-def test_cameras_too_far_for_single_precision_are_refused():
-    pose = look_at((5e5, 5.4e6, 0.0), (5e5 + 1, 5.4e6, 0.0))
-    paste_objects(frame_at(pose, np.inf), CAMERA, [])
-    with pytest.raises(InputError, match=r"camera at \[500000.0, 5400000.0, 0.0\] m:"):
-        paste_objects(frame_at(pose, np.inf), CAMERA, [PosedField(homogeneous())])
+def test_without_objects_frames_stay():
+    frame = frame_at(AHEAD, np.inf)
+    assert Paster(CAMERA, []).paste(frame) is frame
 
 
-def test_bad_input():
-    pose = look_at((-4.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    frame = frame_at(pose, np.inf)
-    with pytest.raises(InputError, match="frame: image .12, 16, 3.*6 x 8 pixels"):
-        paste_objects(frame, from_fov(8, 6, 60.0), [PosedField(homogeneous())])
-    with pytest.raises(InputError, match="objects: GridField; only posed fields"):
-        paste_objects(frame, CAMERA, [homogeneous()])
-    assert paste_objects(frame, CAMERA, []) is frame
+def paste(camera=CAMERA, pose=AHEAD, make=posed):
+    return lambda: Paster(camera, [make(1.0)]).paste(frame_at(pose, np.inf))
+
+
+FAR = look_at((5e5, 5.4e6, 0.0), (5e5 + 1, 5.4e6, 0.0))
+test_bad_input = refusals(
+    (paste(pose=FAR), r"camera at \[500000.0, 5400000.0, 0.0\] m:"),
+    (paste(from_fov(8, 6, 60.0)), "frame: image .12, 16, 3.*6 x 8 pixels"),
+    (paste(make=homogeneous), "objects: GridField"),
+)

@@ -9,26 +9,32 @@ import shutil
 
 import numpy as np
 import pytest
-from helpers.made_runs import PICTURES, make_retraining, make_run, make_transfer
-from helpers.page_reader import PageReader
 from PIL import Image
+from support.files.runs import PICTURES, make_retraining, make_run, make_transfer
+from support.pages.read import PageReader
 
 from mi_nerfattack import cli
 from mi_nerfattack.experiment.page.run import read_run
 from mi_nerfattack.experiment.page.write import write_page
 from mi_nerfattack.io import files
-from mi_nerfattack.report.pages.parts import Parts
+from mi_nerfattack.report.pages.elements import Parts
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 
-def report(*words):
-    return cli.main(["report", *map(str, words)])
+@pytest.fixture
+def page_of(tmp_path):
+    """Return what writes the page of folders, and its text and what a reader finds."""
 
+    def read(*names, options=()):
+        path, folders = tmp_path / "page.html", [str(tmp_path / name) for name in names]
+        assert cli.main(["report", *folders, "-o", str(path), *options]) == 0
+        page = files.read_text(path)
+        reader = PageReader(page)
+        reader.check_alone()
+        return page, reader
 
-def page_of_run(folder):
-    parts = Parts(runs=[read_run(folder / "run", "run")])
-    write_page(folder / "page.html", parts, folder)
+    return read
 
 
 def decoded(address):
@@ -38,8 +44,10 @@ def decoded(address):
 
 
 def test_a_run_is_on_one_page(tmp_path):
-    document = make_run(tmp_path / "run")
-    page_of_run(tmp_path)
+    document = make_run(tmp_path / "run", frames=4)
+    shutil.rmtree(tmp_path / "run" / "frames" / "surrogate_random")
+    parts = Parts(runs=[read_run(tmp_path / "run", "run")])
+    write_page(tmp_path / "page.html", parts, tmp_path)
     page = files.read_text(tmp_path / "page.html")
     reader = PageReader(page)
     reader.check_alone()
@@ -61,17 +69,10 @@ def test_a_run_is_on_one_page(tmp_path):
     assert ["run", "7", command] in reader.rows
     sizes = [decoded(image["src"]).shape for image in reader.images]
     assert sizes.count((5, 6, 3)) == len(PICTURES)
-    assert sizes.count((4 * 4, 8, 3)) == 3  # frames
-    assert len(sizes) == len(PICTURES) + 3 + 1  # and a turntable
-
-
-def test_frames_are_scrubbed_beside_each_other(tmp_path):
-    make_run(tmp_path / "run", frames=4)
-    shutil.rmtree(tmp_path / "run" / "frames" / "surrogate_random")
-    page_of_run(tmp_path)
-    page = files.read_text(tmp_path / "page.html")
-    sheets = [i for i in PageReader(page).images if "frame by frame" in i["alt"]]
+    # frames of two cases, and a turntable
+    sheets = [i for i in reader.images if "frame by frame" in i["alt"]]
     assert [i["alt"].split(", ")[1] for i in sheets] == ["no object", "attack"]
+    assert len(sizes) == len(PICTURES) + 2 + 1
     # farthest out after 2 periods of 0.1 s, where the slider begins
     assert "0.2 s, -1.20 m</span>" in page and 'value="2"' in page
     for number, sheet in zip((0, 2), sheets, strict=True):
@@ -81,41 +82,40 @@ def test_frames_are_scrubbed_beside_each_other(tmp_path):
         np.testing.assert_allclose(means, 60 * number + 10 * np.arange(4), atol=3)
 
 
-def test_several_runs_stand_side_by_side(tmp_path, capsys):
-    documents = {
-        name: make_run(tmp_path / name, attacked, pictures=False, flags=[])
-        for name, attacked in (("one", 1.2), ("two", 2.4))
-    }
-    folders = [tmp_path / name for name in documents]
-    assert report(*folders, "-o", tmp_path / "page.html", "--title", "Both & all") == 0
-    assert "page.html" in capsys.readouterr().out
-    page = files.read_text(tmp_path / "page.html")
-    reader = PageReader(page)
-    reader.check_alone()
+def test_several_runs_stand_side_by_side(tmp_path, page_of):
+    documents = {}
+    for name, attacked, linf in (("one", 1.2, None), ("two", 2.4, 0.1)):
+        attack = {
+            "method": {"kind": "gradient"},
+            "freedom": {"kind": "texture", "linf": linf},
+        }
+        scenario = {"name": name, "vehicle": {"dt_s": 0.1}, "objects": []}
+        scenario["attack"] = attack
+        changes = {"pictures": False, "flags": [], "scenario": scenario}
+        documents[name] = make_run(tmp_path / name, attacked, **changes)
+    page, reader = page_of("one", "two", options=["--title", "Both & all"])
     assert "<h1>Both &amp; all</h1>" in page
     for name, document in documents.items():
         cases = document["routes"]["straight"]["surrogate"]
-        means = [
-            cases[case]["cross_track_mean_m"]
-            for case in ("no_object", "random", "attack")
-        ]
+        shown = "no_object", "random", "attack"
+        means = [cases[case]["cross_track_mean_m"] for case in shown]
         row = next(row for row in reader.rows if row[0] == name)
         assert [row[3], row[4], row[6]] == [f"{mean:.3f}" for mean in means]
         assert row[7] == f"{means[2] / means[1]:.1f}"
-    assert "Damage against frames, straight" in {i["alt"] for i in reader.images}
-    # what is missing, and what makes it
-    resume = re.escape(f"{folders[0] / 'scenario.toml'} -o {folders[0]}")
-    assert re.search(f"without pictures; this writes them: .*{resume}", page)
+    plots = {i["alt"] for i in reader.images}
+    assert "Damage against frames, straight" in plots
+    # where textures had other limits
+    assert "Damage against the texture's budget, linf" in plots
+    assert "Damage against the texture's budget, l2" not in plots
+    # what makes the pictures that are missing
+    folder = tmp_path / "one"
+    assert f"attack {folder / 'scenario.toml'} -o {folder}" in reader.text
 
 
-def test_transfers_and_retrainings_are_tables(tmp_path):
+def test_transfers_and_retrainings_are_tables(tmp_path, page_of):
     make_transfer(tmp_path / "moved")
     make_retraining(tmp_path / "better-retrain.json")
-    words = tmp_path / "moved", tmp_path / "better-retrain.json"
-    assert report(*words, "-o", tmp_path / "page.html") == 0
-    page = files.read_text(tmp_path / "page.html")
-    reader = PageReader(page)
-    reader.check_alone()
+    page, reader = page_of("moved", "better-retrain.json")
     assert "<title>transfer moved, retraining better</title>" in page
     assert ["environment", "case", "day", "<noon>"] in reader.rows
     # nothing was driven at noon in the surrogate; of attacks, how many are out
@@ -131,64 +131,43 @@ def test_transfers_and_retrainings_are_tables(tmp_path):
     assert ["surrogate", "day", "0.050", "0.800", *middle] in reader.rows
     after = "0.060", "0.090", "0.045 to 0.180", "1.50", "0/8", "0/2 25 to 75 %"
     assert ["", "", "after", *after] in reader.rows
-    assert "Left out: third: the expert leaves its lane" in reader.text
+    assert "third: the expert leaves its lane" in reader.text
 
 
-def test_damage_is_laid_against_what_textures_may_change(tmp_path):
-    for name, linf in (("free", None), ("little", 0.1)):
-        scenario = {
-            "name": name,
-            "vehicle": {"dt_s": 0.1},
-            "objects": [],
-            "attack": {"method": "gradient", "parameters": "texture", "linf": linf},
-        }
-        make_run(tmp_path / name, pictures=False, scenario=scenario)
-    words = tmp_path / "free", tmp_path / "little"
-    assert report(*words, "-o", tmp_path / "page.html") == 0
-    shown = {
-        i["alt"]
-        for i in PageReader(files.read_text(words[0].parent / "page.html")).images
-    }
-    assert "Damage against the texture's budget, linf" in shown
-    assert "Damage against the texture's budget, l2" not in shown
+def unfinished(name):
+    """Return what makes a run of which a file is missing."""
+
+    def make(folder):
+        make_run(folder, pictures=False)
+        (folder / name).unlink()
+
+    return make
 
 
 @pytest.mark.parametrize(
-    ("make", "told"),
+    ("make", "where"),
     [
-        (lambda place: make_transfer(place, complete=False), "rows are missing"),
-        (lambda place: (place / "cells").mkdir(parents=True), "no cell is done"),
-        (lambda place: place.write_text("{}"), "is not of 'mi-nerfattack retrain'"),
+        (lambda it: make_transfer(it, complete=False), "it/transfer.json"),
+        (lambda it: (it / "cells").mkdir(parents=True), "it"),
+        (lambda it: it.write_text("{}"), "it"),
+        (lambda it: it.mkdir(), "it"),
+        (unfinished("metrics.json"), "it"),
+        (unfinished("scenario.toml"), "it"),
     ],
 )
-def test_what_is_not_finished_is_refused(tmp_path, capsys, make, told):
+def test_what_is_not_finished_is_refused(tmp_path, capsys, make, where):
     make(tmp_path / "it")
-    assert report(tmp_path / "it", "-o", tmp_path / "page.html") == 2
-    assert told in capsys.readouterr().err
-    assert not (tmp_path / "page.html").exists()
-
-
-@pytest.mark.parametrize(
-    ("damage", "told"),
-    [
-        (lambda run: (run / "metrics.json").unlink(), "goes on with an unfinished one"),
-        (lambda run: (run / "scenario.toml").unlink(), "holds no results; give run"),
-        (lambda run: (run / "metrics.json").write_text("{}"), "metrics.schema"),
-        (lambda run: shutil.rmtree(run), "holds no results; give run"),
-    ],
-)
-def test_what_is_no_finished_run_is_refused(tmp_path, capsys, damage, told):
-    make_run(tmp_path / "run", pictures=False)
-    damage(tmp_path / "run")
-    assert report(tmp_path / "run", "-o", tmp_path / "page.html") == 2
-    assert told in capsys.readouterr().err
-    assert not (tmp_path / "page.html").exists()
+    page = tmp_path / "page.html"
+    assert cli.main(["report", str(tmp_path / "it"), "-o", str(page)]) == 2
+    assert f"error: {tmp_path / where}: " in capsys.readouterr().err
+    assert not page.exists()
 
 
 def test_wrong_words_are_refused(tmp_path, capsys):
     make_run(tmp_path / "run", pictures=False)
-    assert report(tmp_path / "run", "-o", tmp_path / "page.pdf") == 2
-    assert "name an .html file" in capsys.readouterr().err
-    twice = tmp_path / "run", tmp_path / "x" / ".." / "run"
-    assert report(*twice, "-o", tmp_path / "page.html") == 2
-    assert "each once" in capsys.readouterr().err
+    (tmp_path / "x").mkdir()
+    run, twice = str(tmp_path / "run"), str(tmp_path / "x" / ".." / "run")
+    rows = ([run], "page.pdf", "-o"), ([run, twice], "page.html", "FOLDER")
+    for folders, name, where in rows:
+        assert cli.main(["report", *folders, "-o", str(tmp_path / name)]) == 2
+        assert f"{where}: " in capsys.readouterr().err

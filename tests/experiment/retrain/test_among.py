@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import shutil
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import attack_jobs
-from helpers import toy_loop as toy
-from helpers.roadside import PaintedSite, small
+from support.worlds import attacks as attack_jobs
+from support.worlds.places import PaintedSite, small
 
 from mi_nerfattack.deploy.sites import PlaceSite, Weather
 from mi_nerfattack.errors import InputError
@@ -20,19 +20,22 @@ from mi_nerfattack.experiment.retrain.among import (
     attacked_objects,
     found_place,
 )
+from mi_nerfattack.experiment.retrain.anew import attack_anew
 from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.fields import GridField, load_grid, save_field
+from mi_nerfattack.io import locks
 from mi_nerfattack.rollout.drive import ATTACK
 from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.scenario.world import build_world, driven_route
 from mi_nerfattack.system.workers import InThisProcess
 from mi_nerfattack.training.collect import collect
 from mi_nerfattack.training.sources import Scattered
+from tests.experiment.conftest import CAMERA
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 CHANGES = {
-    "[drive]": f"[camera]\nwidth = {toy.WIDTH}\nheight = {toy.HEIGHT}\n[drive]",
+    "[drive]": CAMERA,
     "horizon = 2": "horizon = 200",
     "[7.0, 4.2, 1.6]": "[-5.0, 2.6, 1.6]",
 }
@@ -47,9 +50,7 @@ def found(tmp_path_factory) -> tuple[FoundAttack, ...]:
     folder = attack_jobs.write_scenario(tmp_path_factory.mktemp("scenario"), CHANGES)
     path = folder / "scenario.toml"
     text = path.read_text()
-    item = load_grid(folder / "object.safetensors")
-    item.set_parameter("density", np.full(item.n_vertices, 3.0, np.float32))
-    save_field(folder / "object.safetensors", item)
+    attack_jobs.make_dense(folder)
     runs = []
     for number, (x, offset) in enumerate(((-5.0, 0 * SHIFT), (12.0, SHIFT))):
         path.write_text(text.replace("[-5.0,", f"[{x},"))
@@ -69,13 +70,10 @@ def read(path: Path, run: Path, offset: np.ndarray, number: int) -> FoundAttack:
     return FoundAttack(run, run.name, scenario, route, *rest)
 
 
-def take(found, folder: Path, site=None, **changes):
-    site = site or PaintedSite()
-    routes = [found[0].route]
-    settings = small(**({"frames": 96, "margin_m": 0.0} | changes))
-    here, staging = InThisProcess(), AmongFound(tuple(found))
-    source = Scattered()
-    collect(site, routes, source, settings, folder, here, staging=staging)
+def take(found, folder: Path, frames: int = 96) -> PaintedSite:
+    site, settings = PaintedSite(), small(frames=frames, margin_m=0.0)
+    routes, staging, here = [found[0].route], AmongFound(tuple(found)), InThisProcess()
+    collect(site, routes, Scattered(), settings, folder, here, staging=staging)
     return site
 
 
@@ -131,28 +129,24 @@ def taken_image(environment, run, pose, objects):
 
 def test_frames_among_other_attacks_are_refused(found, tmp_path):
     take(found, tmp_path, frames=12)
-    with pytest.raises(InputError, match=r"here\)\n  staging.found"):
-        take(found[:1], tmp_path, frames=12)
-    with pytest.raises(InputError, match=r"  staging.found"):
-        collect(
-            PaintedSite(objects=False),
-            [found[0].route],
-            Scattered(),
-            small(frames=12, margin_m=0.0),
-            tmp_path,
-            InThisProcess(),
-        )
     other = dataclasses.replace(found[0], digest="another")
-    with pytest.raises(InputError, match=r"  staging.found"):
-        take([other, found[1]], tmp_path, frames=12)
+    for attacks in (found[:1], [other, found[1]]):
+        with pytest.raises(InputError, match=r"  staging.found"):
+            take(attacks, tmp_path, frames=12)
 
 
 def test_runs_of_other_places_are_refused(found, tmp_path):
     path = tmp_path / "scenario.toml"
     shutil.copytree(found[0].folder.parent, tmp_path, dirs_exist_ok=True)
-    path.write_text(
-        path.read_text().replace("[drive]", "[vehicle]\ndt_s = 0.2\n[drive]")
-    )
+    text = path.read_text()
+    path.write_text(text.replace("[drive]", "[vehicle]\ndt_s = 0.2\n[drive]"))
     other = read(path, tmp_path / "run0", 0 * SHIFT, 3)
-    with pytest.raises(InputError, match=r"vehicle.dt_s: 0.2 -> 0.1\n.*one place at a"):
+    with pytest.raises(InputError, match=r"vehicle.dt_s: 0.2 -> 0.1\n"):
         found_place([found[0], other])
+
+
+def test_a_second_process_is_refused_before_it_attacks_anew(tmp_path):
+    nothing: Any = None
+    with locks.exclusive(tmp_path), pytest.raises(InputError, match="another process"):
+        attack_anew([], Path("absent"), tmp_path, nothing)
+    assert not list(tmp_path.iterdir())

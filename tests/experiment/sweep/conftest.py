@@ -41,8 +41,8 @@ name = "gradient"
 
 [[methods]]
 name = "blocks"
-set.attack.method = "blocks"
-set.attack.first_block = 0.5
+set.attack.method.kind = "blocks"
+set.attack.method.first_block = 0.5
 """
 
 
@@ -80,7 +80,7 @@ def finish(cell, sweep):
         "routes": {"line": {"surrogate": {"attack": {"per_run": [drive]}}}},
         "baseline": {"textures": 2},
         "curve": {"frames": [4, 16, 28, 40], "objective": [0, -1, -2, -3]},
-        "scenario": {"attack": {"method": cell.method}},
+        "scenario": {"attack": {"method": {"kind": cell.method}}},
         "converged": True,
         "flags": [],
     }

@@ -1,22 +1,35 @@
-"""Which cells are done, how often, and what the table says of them."""
+"""Which cells are done, how often, what they share, and what the table says of them."""
 
 from __future__ import annotations
 
-import json
+import shutil
+from dataclasses import replace
 
+import numpy as np
 import pytest
+from support.faults.refusals import refused_at
 
+from mi_nerfattack.drives.store import Store, drive_files, read_drive
+from mi_nerfattack.drives.table import read_csv, records, write_csv
 from mi_nerfattack.errors import InputError, RefusedError
+from mi_nerfattack.experiment.cases import Cases
 from mi_nerfattack.experiment.sweep.cell import folder_of, is_complete, run_cell
+from mi_nerfattack.experiment.sweep.grid import load_cells
+from mi_nerfattack.experiment.sweep.summary import Taken, read_taken, write_summary
 from mi_nerfattack.experiment.sweep.sweep import Cells, Sweep
-from mi_nerfattack.experiment.sweep.table import SCHEMA, read_table
+from mi_nerfattack.experiment.sweep.table import (
+    COLUMNS,
+    make_table,
+    read_made,
+    read_table,
+    write_table,
+)
 from mi_nerfattack.io import files
+from mi_nerfattack.rollout.drive import ATTACK
+from mi_nerfattack.scenario.world import Appearance, build_world
 from mi_nerfattack.system.workers import InThisProcess, _failed, failure
 from tests.experiment.sweep.conftest import finish
 
-parquet = pytest.importorskip(
-    "pyarrow.parquet", reason="needs the extra 'sweep': pyarrow writes the table"
-)
 pytestmark = pytest.mark.usefixtures("variant")
 
 
@@ -27,7 +40,7 @@ def sweep(cells, folder, task):
 
 
 def table(folder):
-    return parquet.read_table(folder / "results.parquet").to_pylist()
+    return records(read_table(folder / "results.csv")[list(COLUMNS)])
 
 
 class Tasks:
@@ -48,58 +61,63 @@ class Tasks:
         finish(cell, folder)
 
 
+def figures_of(cell):
+    """Return the row of the drive that `finish` makes."""
+    labels = {"cell": cell.id, "route": "line", "objects": "ball", "seed": cell.seed}
+    labels |= {"method": "gradient", "budget": None, "environment": "surrogate"}
+    labels |= {"case": "attack", "run": 0, "frames": 40, "steps": 30}
+    figures = {"cross_track_mean_m": 0.1 * cell.seed, "wheel_out_s": 1.5}
+    return labels | figures | {"departed": True, "status": "complete", "error": None}
+
+
 def test_the_table(cells, tmp_path):
     found = sweep(cells, tmp_path, Tasks())
     assert found.steps == 4 and not found.errors
-    stored = parquet.read_table(tmp_path / "results.parquet")
-    assert stored.schema.names == list(SCHEMA)
-    assert stored.schema.metadata[b"format"] == b"mi_nerfattack sweep 1"
-    rows = stored.to_pylist()
-    assert [row["seed"] for row in rows] == [0, 1, 2, 3]
-    for cell, row in zip(cells, rows, strict=True):
-        assert json.loads(row.pop("digests")) == cell.scenario.digests()
-        assert json.loads(row.pop("versions")) == {"numpy": "2"}
-        assert row.pop("scenario") == cell.text
-        assert row == {
-            "cell": cell.id,
-            "route": "line",
-            "objects": "ball",
-            "method": "gradient",
-            "budget": None,
-            "seed": cell.seed,
-            "environment": "surrogate",
-            "case": "attack",
-            "run": 0,
-            "frames": 40,
-            "steps": 30,
-            "cross_track_mean_m": 0.1 * cell.seed,
-            "wheel_out_s": 1.5,
-            "departed": True,
-            "status": "complete",
-            "error": None,
+    assert table(tmp_path) == [figures_of(cell) for cell in cells]
+    assert read_made(tmp_path) == {
+        cell.id: {
+            "digests": cell.scenario.digests(),
+            "versions": {"numpy": "2"},
+            "scenario": cell.text,
         }
+        for cell in cells
+    }
+    totals = read_table(tmp_path / "results.csv")["cross_track_total"]
+    assert totals.tolist() == [30 * (0.1 * seed) for seed in range(4)]
 
 
-def test_a_table_is_read_and_others_refused(cells, tmp_path):
-    sweep(cells[:1], tmp_path, Tasks())
-    path, other = tmp_path / "results.parquet", tmp_path / "other.parquet"
-    whole = table(tmp_path)
-    assert read_table(path, ["cell", "scenario"]) == [
-        {name: row[name] for name in ("cell", "scenario")} for row in whole
-    ]
-    assert "scenario" not in read_table(path)[0]
-    raw = path.read_bytes()
-    for damaged in (raw[:-300], b"PAR1" + bytes(100), b""):
-        other.write_bytes(damaged)
-        with pytest.raises(InputError, match="no Parquet file, or a damaged one"):
-            read_table(other)
-    stored = parquet.read_table(path)
-    parquet.write_table(stored.replace_schema_metadata({}), other)
-    with pytest.raises(InputError, match="not a sweep's table"):
-        read_table(other)
-    parquet.write_table(stored.drop_columns(["run"]), other)
-    with pytest.raises(InputError, match="columns run are missing or others"):
-        read_table(other)
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        (",run,", ",number,", "number, run"),
+        (",30,", ",many,", "damaged"),
+        (",30,", ",,", "damaged"),
+        (",complete,", ",,", "damaged"),
+        (",complete,\n", ",compl", "last line"),
+        ("cell,", '"cell,', "table"),
+    ],
+)
+def test_other_tables_are_refused(cells, tmp_path, old, new, named):
+    write_table(tmp_path, [figures_of(cells[0])], {})
+    path = tmp_path / "results.csv"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with refused_at(path, named):
+        read_table(path)
+
+
+def test_numbers_and_texts_come_back_as_they_were(tmp_path):
+    """Floats to the bit; commas, quotes and lines in texts, and words like NA."""
+    powers = 10.0 ** np.arange(-100, 100)
+    values = np.random.default_rng(0).standard_normal(200) * powers
+    labels = {"cell": 'a, "b"\nc', "route": "NA", "seed": 2**60}
+    rows = [labels | {"cross_track_mean_m": value} for value in values.tolist()]
+    write_csv(tmp_path / "table.csv", make_table(rows))
+    found = records(read_csv(tmp_path / "table.csv", COLUMNS))
+    assert found == records(make_table(rows))
+    assert [row["cross_track_mean_m"] for row in found] == values.tolist()
+    assert all(row[name] == value for row in found for name, value in labels.items())
 
 
 def test_failed_cells_are_tried_twice_more_and_stay_as_rows(cells, tmp_path):
@@ -116,9 +134,10 @@ def test_failed_cells_are_tried_twice_more_and_stay_as_rows(cells, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         sweep(cells, tmp_path, interrupted)
     assert table(tmp_path)[2]["error"] == "seed 2: is unlucky"
+    (tmp_path / "results.csv").unlink()  # it is made of the cells
     last = Tasks()
-    assert not sweep(cells, tmp_path, last).errors
-    assert last.done == [2]
+    again = sweep(cells, tmp_path, last)
+    assert last.done == [2] and again.kept == 3 and not again.errors
     assert [row["status"] for row in table(tmp_path)] == ["complete"] * 4
     assert not list((tmp_path / "failed").iterdir())
 
@@ -135,23 +154,9 @@ def test_a_cell_that_would_prove_nothing_is_refused_once(cells, tmp_path):
     found = sweep(cells, tmp_path, task)
     assert done == [0, 1, 2, 3] and list(found.errors) == [1]
     assert table(tmp_path)[1]["error"] == "an attack would prove nothing"
-
-
-def test_a_refusal_stays_one_from_process_to_process():
-    told = _failed(RefusedError("no"))
-    assert isinstance(failure(0, told), RefusedError)
+    # from process to process
+    assert isinstance(failure(0, _failed(RefusedError("no"))), RefusedError)
     assert not isinstance(failure(0, _failed(InputError("no"))), RefusedError)
-
-
-def test_complete_cells_outlive_an_interruption(cells, tmp_path):
-    with pytest.raises(KeyboardInterrupt):
-        sweep(cells, tmp_path, Tasks({2: -1}))
-    assert [row["seed"] for row in table(tmp_path)] == [0, 1]
-    (tmp_path / "results.parquet").unlink()  # it is made of the cells
-    rest = Tasks()
-    found = sweep(cells, tmp_path, rest)
-    assert rest.done == [2, 3] and found.kept == 2
-    assert [row["seed"] for row in table(tmp_path)] == [0, 1, 2, 3]
 
 
 def test_cells_of_another_grid_are_not_in_the_table(cells, tmp_path):
@@ -164,40 +169,155 @@ def test_cells_of_another_grid_are_not_in_the_table(cells, tmp_path):
 
 def test_a_cell_whose_files_are_on_another_disk_has_failed(cells, tmp_path):
     found = sweep(cells[:1], tmp_path, lambda cell, folder, on_step: None)
-    assert "must be on a disk that all machines share" in found.errors[0]
+    assert "disk that all machines share" in found.errors[0]
 
 
-def test_a_real_cell_goes_on_where_it_was(cells, tmp_path, no_results):
-    """The run folder is that of an attack, whose checkpoint is taken up."""
-    cell, steps = cells[0], []
-
-    def stop():
-        steps.append(0)
-        if len(steps) == 70:  # among the iterations
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        run_cell(cell, tmp_path, stop)
-    folder = folder_of(tmp_path, cell)
-    assert (folder / "checkpoint.safetensors").exists()
-    assert not is_complete(tmp_path, cell)
-    before = len(steps)
-    run_cell(cell, tmp_path, lambda: steps.append(0))
-    assert is_complete(tmp_path, cell)
-    about = files.read_json(folder / "cell.json")
-    assert about["digests"] == cell.digests and "mitsuba" in about["versions"]
-    done = len(steps)
-    run_cell(cell, tmp_path, lambda: steps.append(0))
-    assert len(steps) == done > before
+def test_a_cell_is_refused_where_its_files_are_others(cells, tmp_path):
+    other = replace(cells[0], digests=cells[0].digests | {"scene.routes": "0"})
+    with pytest.raises(InputError, match="scene.routes: other"):
+        run_cell(other, tmp_path, lambda: None)
+    assert not folder_of(tmp_path, other).exists()
 
 
-def test_a_cell_is_refused_where_its_files_are_others(cells, tmp_path, scenario_folder):
-    route = scenario_folder / "routes.json"
-    text = route.read_text()
-    route.write_text(text + "\n")
-    try:
-        with pytest.raises(InputError, match="scenario, scene.routes: other"):
-            run_cell(cells[0], tmp_path, lambda: None)
-    finally:
-        route.write_text(text)
-    assert not folder_of(tmp_path, cells[0]).exists()
+GRID = """\
+scenario = "scenario.toml"
+budgets = [120]
+
+[[methods]]
+name = "blocks"
+set.attack = { method.kind = "blocks", deterministic = true }
+set.baseline.textures = 2
+
+[[methods]]
+name = "random"
+set.attack = { method.kind = "random", deterministic = true }
+set.baseline.textures = 2
+"""
+
+
+@pytest.fixture
+def methods(scenario_folder):
+    """Return two cells that differ by their method alone."""
+    path = scenario_folder / "shared.toml"
+    path.write_text(GRID)
+    return load_cells(path)
+
+
+def test_shared_drives_are_those_of_a_cell_alone(methods, tmp_path, no_results):
+    first, second = methods
+    steps = {"together": [], "alone": []}
+
+    def shared_by(sweep):
+        return {path.name for path in drive_files(sweep / "shared")}
+
+    together, alone = tmp_path / "together", tmp_path / "alone"
+    run_cell(first, together, lambda: None)
+    made = shared_by(together)
+    for sweep in (together, alone):
+        run_cell(second, sweep, lambda name=sweep.name: steps[name].append(0))
+    own = {name for name in shared_by(together) if name.startswith(ATTACK)}
+    assert shared_by(together) == made | own
+    assert shared_by(alone) - own == {name for name in made if ATTACK not in name}
+    saved, folders = 0, [folder_of(sweep, second) for sweep in (together, alone)]
+    pairs = [drive_files(folder / "drives") for folder in folders]
+    for one, other in zip(*pairs, strict=True):
+        assert one.name == other.name
+        first_drive, second_drive = read_drive(one).arrays(), read_drive(other).arrays()
+        assert all((first_drive[k] == second_drive[k]).all() for k in first_drive)
+        saved += second.scenario.drive.horizon * (not one.name.startswith(ATTACK))
+    assert len(steps["alone"]) - len(steps["together"]) == saved
+    written = folders[0] / "cell.json"
+    about, time = files.read_json(written), written.stat().st_mtime_ns
+    assert about["digests"] == second.digests and "mitsuba" in about["versions"]
+    # a cell that is complete is not done again
+    run_cell(second, together, lambda: None)
+    assert is_complete(together, second) and written.stat().st_mtime_ns == time
+
+
+def test_what_decides_about_a_drive_tells_it_apart(methods, tmp_path):
+    first, second = (cell.scenario for cell in methods)
+    world = build_world(first, first.build_policy())
+    look = world.appearance()
+
+    def digest(world=world, label="surrogate", look: Appearance | None = look, run=0):
+        identity, quiet = world.scenario.identity(), lambda *told: None
+        cases = Cases(world, Store(tmp_path), identity, quiet, quiet)
+        cases.looks["own"] = look
+        return cases.of_case(label, "own")[run].digest
+
+    assert digest() == digest(replace(world, scenario=second))
+    moved = replace(look, offsets=look.offsets + 0.1)
+    painted = replace(look, textures=[value + 1 for value in look.textures])
+    jittered = first.attack.model_copy(update={"jitter": not first.attack.jitter})
+    others = {
+        digest(look=None),
+        digest(look=moved),
+        digest(look=painted),
+        digest(run=1),
+        digest(replace(world, initial=world.initial + 0.5)),
+        digest(replace(world, scenario=first.model_copy(update={"seed": 9}))),
+        digest(replace(world, scenario=first.model_copy(update={"attack": jittered}))),
+        *(digest(label=label) for label in world.deployments),
+    }
+    assert len(others) == 7 + len(world.deployments) and digest() not in others
+
+
+NOTHING = Taken()
+
+
+def sweep_taking(cells, folder, taken=NOTHING):
+    """Do cells by a stand-in; returns those that were done, and the summary."""
+    done = []
+
+    def task(cell, folder, on_step):
+        done.append(cell.seed)
+        if cell.seed == 3 and not taken.rows:
+            raise InputError("is unlucky")
+        finish(cell, folder)
+
+    Sweep(Cells(tuple(cells), folder, task=task), taken=taken).run(InThisProcess())
+    return done, write_summary(folder, taken.attacks)
+
+
+@pytest.fixture
+def elsewhere(cells, tmp_path):
+    """Return table and summary of a sweep whose last cell failed; no folders."""
+    folder = tmp_path / "elsewhere"
+    sweep_taking(cells, folder)
+    shutil.rmtree(folder / "cells")
+    return folder
+
+
+def test_complete_cells_are_not_done_again(cells, elsewhere, tmp_path):
+    whole, again = tmp_path / "whole", tmp_path / "again"
+    other = replace(cells[2], digests={"scenario": "0123456789abcdef"})
+    changed = [*cells[:2], other, cells[3]]
+    done, summary = sweep_taking(changed, again, read_taken([elsewhere]))
+    assert done == [2, 3]  # another cell, and the one that had failed
+    assert not folder_of(again, cells[0]).exists()
+    _, alone = sweep_taking(changed, whole, Taken(rows={"none": []}))
+    assert summary == alone and len(summary["attacks"]) == 4
+    for name in ("results.csv", "cells.json"):
+        assert (again / name).read_text() == (whole / name).read_text()
+    made = read_made(again)
+    assert {name: about["scenario"] for name, about in made.items()} == {
+        cell.id: cell.text for cell in changed
+    }
+    # what was taken stays told where the folder's own summary is all that there is
+    assert write_summary(again) == summary
+
+
+def test_the_first_folder_that_has_a_cell_counts(cells, elsewhere, tmp_path):
+    second = tmp_path / "second"
+    _, summary = sweep_taking(cells, second, Taken(rows={"none": []}))
+    taken = read_taken([elsewhere, second])
+    assert taken.rows.keys() == {cell.id for cell in cells}
+    assert taken.attacks.keys() == {one["cell"] for one in summary["attacks"]}
+    (elsewhere / "summary.json").unlink()
+    assert read_taken([elsewhere]).attacks == {}
+    files.write_json(elsewhere / "summary.json", {"schema": 0})
+    nowhere = tmp_path / "nowhere"
+    wrong = {nowhere: nowhere / "results.csv", elsewhere: elsewhere / "summary.json"}
+    for folder, where in wrong.items():
+        with refused_at(where):
+            read_taken([folder])

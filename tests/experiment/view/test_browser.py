@@ -1,78 +1,18 @@
-"""The viewer and its file in a browser: controls work, and nothing is complained of."""
+"""A drive and a page of results in a browser: nothing complains, nothing is fetched."""
 
 from __future__ import annotations
 
-import os
-import re
-import signal
-import subprocess
-import sys
-from contextlib import contextmanager
-from pathlib import Path
-
 import numpy as np
 import pytest
-from helpers.browser import browser
+from support.files.runs import make_run, make_transfer
+from support.pages.browser import browser
 
 from mi_nerfattack import cli
 from mi_nerfattack.io import files
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("variant")]
 
-TESTS = Path(__file__).parents[2]
-#: The frame, or what lies beside it, as it is shown: pixels, as text.
-SHOWN = """(() => {{
-  const image = document.querySelectorAll("img[src^=blob]")[{0}];
-  if (!image || !image.complete) return "";
-  const canvas = document.createElement("canvas");
-  canvas.width = image.naturalWidth; canvas.height = image.naturalHeight;
-  canvas.getContext("2d").drawImage(image, 0, 0);
-  return canvas.toDataURL();
-}})()"""
-FRAME = SHOWN.format(0)
 SLIDER = "document.querySelector('[role=slider]')"
-HEIGHT = "+[...document.querySelectorAll('input[type=text]')].at(-1).value"
-
-
-@contextmanager
-def view(folder, *more):
-    """Run the command; gives where it listens. Ctrl-C ends it."""
-    words = [sys.executable, "-m", "mi_nerfattack.cli", "view", str(folder), *more]
-    with subprocess.Popen(
-        [*words, "--port", "0"],
-        env={**os.environ, "PYTHONPATH": str(TESTS)},  # of the run's policy
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as child:
-        try:
-            line = child.stdout.readline()
-            found = re.search(r"at (http://127\.0\.0\.1:[0-9]+);", line)
-            assert found, (line, child.stderr.read() if not line else "")
-            yield found[1]
-            child.send_signal(signal.SIGINT)
-            told, complaints = child.communicate(timeout=60)
-            assert (child.returncode, told) == (0, "Ended\n"), complaints
-            assert "Traceback" not in complaints
-        finally:
-            child.kill()
-
-
-def press(page, text):
-    """Press a button by its text."""
-    page.ask(f"""[...document.querySelectorAll("button")].find(
-        (button) => button.innerText === "{text}").click()""")
-
-
-def drag_up(page):
-    """Drag the object, which the camera looks at, by the arrow that points up."""
-    x, y = page.ask("[innerWidth / 2, innerHeight / 2]")
-    y -= 0.07 * y
-    page.mouse("mouseMoved", x, y)
-    page.mouse("mousePressed", x, y, button="left", clickCount=1)
-    for step in range(1, 9):
-        page.mouse("mouseMoved", x, y - 10 * step, button="left", buttons=1)
-    page.mouse("mouseReleased", x, y - 80, button="left", clickCount=1)
 
 
 def draws(page, path):
@@ -84,32 +24,10 @@ def draws(page, path):
     return len(np.unique(part // 16, axis=0)) > 20
 
 
-def test_a_reader_uses_the_viewer(found_run, tmp_path):
-    with browser(tmp_path) as page, view(found_run) as address:
-        page.go(address)
-        first = page.wait(FRAME)
-        page.ask(f"{SLIDER}.focus()")
-        page.key("End", 35)
-        page.wait(f"{FRAME} && {FRAME} !== {first!r}")
-        page.ask(f"{SLIDER}.focus()")
-        page.key("Home", 36)
-        page.wait(f"{FRAME} === {first!r}")
-        assert page.ask(SHOWN.format(1)) not in ("", first)
-        stood = page.ask(HEIGHT)
-        page.until(lambda: draws(page, tmp_path / "first.png"), "drawing")
-        drag_up(page)
-        page.wait(f"{HEIGHT} > {stood} + 0.2")
-        page.wait(f"{FRAME} && {FRAME} !== {first!r}")
-        assert "no policy saw this" in page.ask("document.body.innerText")
-        assert draws(page, tmp_path / "moved.png")
-        press(page, "Put back")
-        page.wait(f"{FRAME} === {first!r}")
-        press(page, "Play")
-        page.wait(f"{SLIDER}.getAttribute('aria-valuenow') === '2'")
-        press(page, "Pause")
-        assert page.told == []
-        known = (address, "data:", f"blob:{address}")
-        assert [x for x in page.requests if not x.startswith(known)] == []
+def check_alone(page, *known):
+    """Check that nothing was complained of, and nothing else was fetched."""
+    assert page.told == []
+    assert [x for x in page.requests if not x.startswith(known)] == []
 
 
 def test_a_file_opens_by_itself(found_run, tmp_path):
@@ -123,6 +41,55 @@ def test_a_file_opens_by_itself(found_run, tmp_path):
         page.until(lambda: draws(page, tmp_path / "file.png"), "drawing")
         told = f"{SLIDER}.getAttribute('aria-valuemax')"
         assert float(page.ask(told)) == pytest.approx(0.3)  # two periods and the end
-        assert page.told == []
-        known = (path.as_uri(), "data:", "blob:")
-        assert [x for x in page.requests if not x.startswith(known)] == []
+        check_alone(page, path.as_uri(), "data:", "blob:")
+
+
+#: Uses the page of results as a reader would, and says what came of it.
+USE = """(() => {
+const found = {}, box = document.querySelector(".scrubber");
+const slider = box.querySelector("input"), button = box.querySelector("button");
+const ground = () => getComputedStyle(document.body).backgroundColor;
+const shut = () => document.querySelectorAll("details:not([open])").length;
+const label = () => box.querySelector("[data-labels]").textContent;
+found.first = label();
+slider.value = 3;
+slider.dispatchEvent(new Event("input"));
+found.moved = label();
+found.at = getComputedStyle(box.querySelector("img")).objectPosition;
+slider.dispatchEvent(new KeyboardEvent("keydown", {key: " "}));
+found.buttons = [button.textContent];
+button.click();
+found.buttons.push(button.textContent);
+found.grounds = [ground()];
+document.getElementById("theme").click();
+found.grounds.push(ground());
+found.wide = document.documentElement.scrollWidth - innerWidth;
+dispatchEvent(new Event("beforeprint"));
+found.shut = [shut()];
+dispatchEvent(new Event("afterprint"));
+found.shut.push(shut());
+return found;
+})()"""
+
+
+@pytest.mark.parametrize("width", [1280, 500])
+def test_a_reader_uses_the_page_of_results(tmp_path, width):
+    for name in ("one", "two"):
+        make_run(tmp_path / name)
+    make_transfer(tmp_path / "moved")
+    names = [str(tmp_path / name) for name in ("one", "two", "moved")]
+    path = tmp_path / "page.html"
+    assert cli.main(["report", *names, "-o", str(path)]) == 0
+    with browser(tmp_path) as page:
+        page.resize(width, 900)
+        page.go(path.as_uri())
+        page.wait("document.readyState === 'complete' && !!document.body.children[0]")
+        found = page.ask(USE)
+        check_alone(page, path.as_uri(), "data:")
+    # farthest out after 0.2 s, where it begins
+    assert (found["first"], found["moved"]) == ("0.2 s, -0.30 m", "0.3 s, +0.20 m")
+    assert found["at"] == "0px 100%"
+    assert found["buttons"] == ["Pause", "Play"]
+    assert found["grounds"][0] != found["grounds"][1]
+    assert found["wide"] <= 0
+    assert found["shut"][0] == 0 < found["shut"][1]

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import json
 import re
-import signal
 
 import drjit as dr
 import numpy as np
 import pytest
-from helpers.faults import short_of_memory, signalled
-from helpers.small_fields import homogeneous, small_ngp
+from support.faults.refusals import refusals
+from support.worlds.fields import homogeneous, small_ngp
 
 from mi_nerfattack import cli
 from mi_nerfattack.capture.scene import drive_poses
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import NGPField, Occupancy, load_field, save_field
 from mi_nerfattack.fit.bake import bake as module
 from mi_nerfattack.fit.bake.bake import BakeOptions, bake, plan_bricks
@@ -44,7 +42,6 @@ deployment = "absent"
 routes = "routes.json"
 route = "line"
 """
-GIVEN = ["field.safetensors", "routes.json", "scenario.toml"]
 
 
 @pytest.fixture
@@ -81,15 +78,14 @@ def test_refinement_brings_bricks_to_the_field(field):
         pair = PosedField(field), PosedField(baked)
         views = score_bake(*pair, [ROUTE], CAMERA, MOUNT, spacing_m=0.5, keep=2)
         assert sum(view.pictures is not None for view in views) == 2
-        seen = min(views, key=lambda view: view.psnr_db)
-        assert seen.pictures is not None and seen.pictures[0].image.std() > 0.02
-        least.append(seen.psnr_db)
-    assert least[1] > least[0] + 1
-    assert least[1] > 28
+        worst = min(views, key=lambda view: view.psnr_db)
+        assert worst.pictures is not None and worst.pictures.wanted.std() > 0.02
+        least.append(worst.psnr_db)
+    assert least[1] > max(least[0] + 1, 28)
 
 
 def test_no_two_draws_share_a_seed(field, monkeypatch):
-    poses, jitter = [], []
+    poses, jitter, rays_of = [], [], module._rays
 
     def scatter(routes, views, seed, mount):
         poses.append(drive_poses(routes, views, seed, mount).tobytes())
@@ -100,7 +96,6 @@ def test_no_two_draws_share_a_seed(field, monkeypatch):
         jitter.append(result.jitter.numpy().tobytes())
         return result
 
-    rays_of = module._rays
     monkeypatch.setattr(module, "drive_poses", scatter)
     monkeypatch.setattr(module, "_rays", keep)
     monkeypatch.setattr(module, "_RAYS_AT_ONCE", 1)  # an image at a time
@@ -112,17 +107,14 @@ def test_no_two_draws_share_a_seed(field, monkeypatch):
 
 
 def test_a_pose_moves_the_bricks_with_the_field(field):
-    wide = Route("wide", 0, POINTS, 7.0)
-    high = CameraMount(0.8, 0.0, 10.0)
-    options = BakeOptions(cone=0.3, views=4)
+    wide, high = Route("wide", 0, POINTS, 7.0), CameraMount(0.8, 0.0, 10.0)
+    options, posed = BakeOptions(cone=0.3, views=4), PosedField(field, POSE)
     here = bake(PosedField(field), [ROUTE], CAMERA, MOUNT, options)
-    there = bake(PosedField(field, POSE), [wide], CAMERA, high, options)
+    there = bake(posed, [wide], CAMERA, high, options)
     np.testing.assert_array_equal(there.subdivisions, here.subdivisions)
     words = [baked.vertices.numpy() for baked in (here, there)]
     assert np.mean(words[0] == words[1]) > 0.9
-    views = score_bake(
-        PosedField(field, POSE), PosedField(there, POSE), [wide], CAMERA, high, 1.0
-    )
+    views = score_bake(posed, PosedField(there, POSE), [wide], CAMERA, high, 1.0)
     assert min(view.psnr_db for view in views) > 25
 
 
@@ -139,37 +131,10 @@ def words(field, tmp_path, monkeypatch) -> list[str]:
     monkeypatch.chdir(tmp_path)
     save_field("field.safetensors", field)
     route = {"goal": 0, "lane_width_m": 7.0, "speed_ms": 5.0}
-    route["points_m"] = POINTS.tolist()
-    (tmp_path / "routes.json").write_text(json.dumps({"line": route}))
+    table = {"line": route | {"points_m": POINTS.tolist()}}
+    (tmp_path / "routes.json").write_text(json.dumps(table))
     (tmp_path / "scenario.toml").write_text(SCENARIO)
     return "bake scenario.toml --views 4 --cone 0.1".split()
-
-
-@pytest.mark.parametrize(
-    ("stage", "number", "left"),
-    [
-        ("baking", signal.SIGINT, []),
-        ("comparing", signal.SIGTERM, ["b.safetensors"]),
-    ],
-)
-def test_an_interrupted_bake_leaves_a_whole_file_or_none(
-    words, tmp_path, capsys, stage, number, left
-):
-    with signalled(stage, number):
-        assert cli.main(words) == 130
-    assert "mi-nerfattack: interrupted" in capsys.readouterr().err
-    found = sorted(path.name for path in tmp_path.iterdir())
-    assert found == [*left, *GIVEN]
-    for name in left:
-        load_field(name)
-
-
-def test_too_little_memory_leaves_no_bake(words, tmp_path, capsys):
-    with short_of_memory("baking"):
-        assert cli.main(words) == 2
-    assert "error: not enough memory: 249 TiB" in capsys.readouterr().err
-    found = sorted(path.name for path in tmp_path.iterdir())
-    assert found == GIVEN
 
 
 def test_the_command_writes_field_and_report(words, tmp_path, capsys):
@@ -187,23 +152,25 @@ def test_the_command_writes_field_and_report(words, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("line", "instead", "message"),
     [
-        ('bricks = "b.safetensors"', "", "--output: give it, or scene.bricks in"),
-        ('bricks = "b', 'bricks = "field', "--output: .* is the field itself"),
-        ("width = 32", "width = 6", "camera of 6 x 20; SSIM takes at least"),
+        ('bricks = "b.safetensors"', "", "--output: .* scene.bricks"),
+        ('bricks = "b', 'bricks = "field', "--output: .* field itself"),
+        ("width = 32", "width = 6", "6 x 20"),
     ],
 )
 def test_what_a_scenario_must_say(words, tmp_path, capsys, line, instead, message):
-    assert line in SCENARIO
     (tmp_path / "scenario.toml").write_text(SCENARIO.replace(line, instead))
     assert cli.main(words) == 2
     assert re.search(message, capsys.readouterr().err)
 
 
-def test_what_cannot_be_baked(field):
-    with pytest.raises(InputError, match="is a grid_field; only an ngp_field is"):
-        plan_bricks(PosedField(homogeneous()), [ROUTE])
+def empty() -> NGPField:
+    field = small_ngp()
     field.occupy(Occupancy(np.zeros((2, 2, 2), bool)))
-    with pytest.raises(InputError, match="bake: the field is empty"):
-        plan_bricks(PosedField(field), [ROUTE])
-    with pytest.raises(InputError, match="cone: 0"):
-        BakeOptions(cone=0)
+    return field
+
+
+test_refused = refusals(
+    (lambda: plan_bricks(PosedField(homogeneous()), [ROUTE]), "grid_field; .*ngp_fie"),
+    (lambda: plan_bricks(PosedField(empty()), [ROUTE]), "bake: the field is empty"),
+    (lambda: BakeOptions(cone=0), "cone: 0"),
+)

@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import small_fields as small
-from helpers.sphere_views import BOX, sphere_views
+from support.worlds import fields as small
+from support.worlds.views import BOX, sphere_views
 
 from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.fields import GridField, GridLayout, NGPField, NGPLayout, Occupancy
@@ -31,6 +31,7 @@ from mi_nerfattack.fit.steps.samples import (
 from mi_nerfattack.render.camera.intrinsics import Camera, from_fov, look_at
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
+from mi_nerfattack.render.walk import sample_count
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -98,19 +99,17 @@ def test_wide_step_equals_the_march(rng, alpha):
 
 def test_rays_beyond_the_room_for_samples_are_left_out(rng):
     field = ngp(rng)
-    batches = source(field)
-    step = PointStep(field, batches, 4096, 300)
-    attach(field, batches.bank.corrections)
+    step = PointStep(field, source(field), 4096, 300)
+    attach(field, step.source.bank.corrections)
     score, _ = step(random_numbers(), dr.opaque(mi.UInt32, RAYS))
-    assert 0 < score.rays[0] < RAYS
-    assert score.kept[0] <= 300
+    assert 0 < score.rays[0] < RAYS and score.kept[0] <= 300
 
 
-def test_listed_samples_are_those_that_rays_cross(rng):
+def test_listed_samples_are_those_that_rays_cross():
     grid, origin, direction = small.half_occupied()
-    rays = Rays(
-        origin, direction, dr.opaque(mi.Float, dr.inf), dr.opaque(mi.Float, 0.5)
-    )
+    far, jitter = dr.opaque(mi.Float, dr.inf), dr.opaque(mi.Float, 0.5)
+    rays = Rays(origin, direction, far, jitter)
+    assert sample_count(PosedField(grid), rays).numpy().tolist() == [4, 2, 0]
     samples = list_samples(PosedField(grid), rays, 5)
     assert samples.fits.numpy().tolist() == [True, False, False]
     assert samples.count.numpy().tolist() == [4, 0, 0]
@@ -148,9 +147,8 @@ def test_networks_against_central_differences(rng, monkeypatch, block):
     slope = rng.normal(size=(10, 4))
 
     def objective() -> float:
-        out = np.empty((10, 4))
+        out, alone = np.empty((10, 4)), np.empty(10)
         Networks(density, colour).forward(features, view, out)
-        alone = np.empty(10)
         Networks(density, colour).raw_density(features, alone)
         np.testing.assert_allclose(alone, out[:, 0])
         return float((out * slope).sum())
@@ -161,21 +159,18 @@ def test_networks_against_central_differences(rng, monkeypatch, block):
     pairs = [(features, by_features)]
     pairs += zip(density.weights + colour.weights, by_density + by_colour, strict=True)
     for value, gradient in pairs:
-        change = rng.normal(size=value.shape)
-        value += 1e-6 * change
-        high = objective()
-        value -= 2e-6 * change
-        low = objective()
-        value += 1e-6 * change
-        central = (high - low) / 2e-6
+        change, ends = rng.normal(size=value.shape), []
+        for step in (1e-6, -2e-6, 1e-6):
+            value += step * change
+            ends.append(objective())
+        central = (ends[0] - ends[1]) / 2e-6
         assert (gradient * change).sum() == pytest.approx(central, rel=1e-5)
 
 
 def test_spread_and_its_derivative_against_all_pairs(rng):
-    count = 7
+    count, width, factor = 7, 0.1, 0.3
     depths = rng.uniform(0.1, 0.6, count)
     place = np.sort(rng.uniform(0, 1, count))
-    width, factor = 0.1, 0.3
 
     def penalty(x: np.ndarray) -> float:
         behind = np.exp(-np.cumsum(x))
@@ -183,21 +178,14 @@ def test_spread_and_its_derivative_against_all_pairs(rng):
         pairs = np.abs(place[:, None] - place[None])
         return float(weight @ pairs @ weight + (weight**2).sum() * width / 3)
 
-    samples = Samples(
-        mi.UInt32([0]),
-        mi.UInt32([count]),
-        mi.Bool([True]),
-        dr.zeros(mi.UInt32, count),
-        mi.Float(place),
-        dr.full(mi.Float, width, count),
-    )
-    found = measure_spread(
-        samples, mi.Float(depths), mi.Float(place), mi.Float(width), mi.Float(factor)
-    )
+    x, t = mi.Float(depths), mi.Float(place)
+    ray, widths = dr.zeros(mi.UInt32, count), dr.full(mi.Float, width, count)
+    one = mi.UInt32([0]), mi.UInt32([count]), mi.Bool([True])
+    samples = Samples(*one, ray, t, widths)
+    found = measure_spread(samples, x, t, mi.Float(width), mi.Float(factor))
     assert found.penalty[0] == pytest.approx(penalty(depths), rel=1e-5)
-    black = dr.zeros(mi.Color3f, count)
-    nothing = March.zeros(1)
-    by_depth, _ = cotangents(samples, mi.Float(depths), black, nothing, nothing, found)
+    black, nothing = dr.zeros(mi.Color3f, count), March.zeros(1)
+    by_depth, _ = cotangents(samples, x, black, nothing, nothing, found)
     for k, step in enumerate(1e-5 * np.eye(count)):
         central = (penalty(depths + step) - penalty(depths - step)) / 2e-5
         assert by_depth[k] == pytest.approx(factor * central, rel=1e-4, abs=1e-6)
@@ -226,72 +214,56 @@ def test_moved_rays_are_those_of_the_corrected_poses(rng):
         np.testing.assert_allclose(a, b, atol=1e-5)
 
 
-def test_intrinsics_of_single_images_make_their_rays():
-    images, _ = sphere_views(2)
-    wide = from_fov(24, 24, 80.0)
-    own = replace(images, cameras=(images.camera, wide))
-    bank = RayBank(own, np.arange(2))
-    corner = bank.batch(mi.UInt32([0, 24 * 24])).direction.numpy().T
-    axes = images.camera_to_world[:, :3, 2]
-    for k, camera in enumerate((images.camera, wide)):
-        tangent = np.sqrt(2) * (12 - 0.5) / camera.fx
-        assert corner[k] @ axes[k] == pytest.approx(1 / np.hypot(1, tangent), rel=1e-5)
+LOW, HIGH = np.full(3, -10.0), np.full(3, 10.0)
+
+
+def views(lens: Camera, *looks, points=None) -> PosedImages:
+    """Blank images from eyes to targets."""
+    poses = np.stack(
+        [look_at(np.array(a, float), np.array(b, float)) for a, b in looks]
+    )
+    pixels = np.zeros((len(poses), 16, 16, 3), np.uint8)
+    names = tuple(map(str, range(len(poses))))
+    return PosedImages(pixels, poses, lens, names, points=points)
+
+
+def seen(images: PosedImages, chosen, *places, edge: int = 40) -> list[bool]:
+    """Return whether the cells at places of a box of 20 m are seen."""
+    cells = seen_cells(images, np.array(chosen), LOW, HIGH, (edge,) * 3)
+    scale = edge / 20
+    return [bool(cells[tuple(int(scale * (v + 10)) for v in at)]) for at in places]
 
 
 def test_cells_that_cameras_see():
-    camera = from_fov(16, 16, 90.0)
-    ahead = look_at(np.zeros(3), np.array([1.0, 0, 0]))
-    across = look_at(np.array([5.0, -5.0, 0]), np.array([5.0, 0, 0]))
-    images = PosedImages(
-        np.zeros((2, 16, 16, 3), np.uint8),
-        np.stack([ahead, across]),
-        camera,
-        ("ahead", "across"),
-    )
-    low, high, shape = np.full(3, -10.0), np.full(3, 10.0), (40, 40, 40)
-
-    def at(cells: np.ndarray, x: float, y: float, z: float) -> bool:
-        return bool(cells[tuple(int(2 * (v + 10)) for v in (x, y, z))])
-
-    first = seen_cells(images, np.array([0]), low, high, shape)
-    assert at(first, 8, 0, 0) and at(first, 8, 7, 7)
-    assert not at(first, -8, 0, 0) and not at(first, 2, 9, 0)
-    both = seen_cells(images, np.arange(2), low, high, shape)
-    assert at(both, 5, 0, 0) and not at(both, 5, -8, 0)  # the second alone
-    assert not at(both, 0.5, 9, 0)
+    wide = from_fov(16, 16, 90.0)
+    looks = ((0, 0, 0), (1, 0, 0)), ((5, -5, 0), (5, 0, 0))
+    images = views(wide, *looks)
+    ahead = (8, 0, 0), (8, 7, 7), (3, 0, 0), (-8, 0, 0), (2, 9, 0)
+    assert seen(images, [0], *ahead) == [True, True, True, False, False]
+    both = (5, 0, 0), (5, -8, 0), (0.5, 9, 0)  # the second: by the second alone
+    assert seen(images, [0, 1], *both) == [True, False, False]
     points = np.random.default_rng(0).uniform([5, -2, -2], [7, 2, 2], (300, 3))
-    clear = seen_cells(replace(images, points=points), np.array([0]), low, high, shape)
-    assert at(first, 3, 0, 0) and not at(clear, 3, 0, 0)  # points begin at 5 m
-    assert at(clear, 5, 0, 0) and at(clear, 3, 3, 3)
+    begin = views(wide, *looks, points=points)  # at 5 m
+    assert seen(begin, [0], (3, 0, 0), (5, 0, 0), (3, 3, 3)) == [False, True, True]
 
 
 def test_the_road_beneath_a_camera_is_seen_from_behind():
-    eyes = [[x, 0.0, 0.0] for x in (0.0, -4.0, -8.0)]
-    poses = np.stack([look_at(eye, np.add(eye, [1, 0, 0])) for eye in eyes])
     road = np.random.default_rng(0).uniform([-9, -1, -1.8], [9, 1, -1.7], (4000, 3))
-    blank = np.zeros((3, 16, 16, 3), np.uint8)
-    camera, names = from_fov(16, 16, 90.0), ("first", "second", "third")
-    images = PosedImages(blank, poses, camera, names, points=road)
-    low, high = np.full(3, -10.0), np.full(3, 10.0)
-    seen = seen_cells(images, np.arange(3), low, high, (40, 40, 40))
-    beneath, before = ((21, 20, 16), (22, 20, 20))  # of the first camera, half metres
-    assert seen[beneath] and not seen[before]
+    looks = [((x, 0, 0), (x + 1, 0, 0)) for x in (0, -4, -8)]
+    images = views(from_fov(16, 16, 90.0), *looks, points=road)
+    beneath, before = (0.5, 0, -2), (1, 0, 0)  # of the first camera
+    assert seen(images, [0, 1, 2], beneath, before) == [True, False]
 
 
 def test_cells_at_the_rim_of_a_distorted_image_are_seen():
     # barrel: the border, 1 / f from the axis, shows what lies farther out
     lens = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, k1=-0.2)
-    pose = look_at(np.zeros(3), np.array([1.0, 0, 0]))
-    images = PosedImages(
-        np.zeros((1, 16, 16, 3), np.uint8), pose[None], lens, ("ahead",)
-    )
-    low, high = np.full(3, -10.0), np.full(3, 10.0)
-    seen = seen_cells(images, np.array([0]), low, high, (200, 200, 200))
     matrix = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])
     first = np.array([[[0.5, 0.5]]])  # pixel
     corner = cv2.undistortPoints(first, matrix, np.array(lens.distortion))[0, 0]
     x, y = 9 * corner  # right and down of the axis
-    assert seen[int(10 * 19), int(10 * (10 - x)), int(10 * (10 - y))]
+    images = views(lens, ((0, 0, 0), (1, 0, 0)))
+    assert seen(images, [0], (9, -x, -y), edge=200) == [True]
 
 
 def test_running_occupancy_finds_the_dense_half():

@@ -9,8 +9,8 @@ import torch
 pytest.importorskip("onnx", reason="the extra onnx is not installed")
 pytest.importorskip("onnxruntime", reason="the extra onnx is not installed")
 
-from helpers.onnx_models import FLOAT, INT64, check, model  # noqa: E402
 from onnx import helper  # noqa: E402
+from support.files.policies import FLOAT, check, model  # noqa: E402
 
 from mi_nerfattack.errors import InputError  # noqa: E402
 from mi_nerfattack.policy.onnx.network import OnnxNetwork  # noqa: E402
@@ -23,7 +23,8 @@ def single(operator, x, constants=(), opset=17, extra=(), **attributes):
     values.pop("", None)
     node = helper.make_node(operator, ["x", *names], ["y", *extra], **attributes)
     kind = helper.np_dtype_to_tensor_dtype(x.dtype)
-    outputs = {name: (kind, None) for name in ("y", *extra)}
+    found = FLOAT if operator == "OneHot" else kind
+    outputs = {name: (found, None) for name in ("y", *extra)}
     check(model([node], {"x": (kind, x.shape)}, outputs, values, opset), x)
 
 
@@ -31,51 +32,30 @@ def integers(*values):
     return np.array(values, np.int64)
 
 
+PLAIN = """Relu LeakyRelu Selu Sigmoid HardSwish Tanh Softplus Softsign Abs Neg Exp Erf
+Sin Cos Identity Dropout Flatten Transpose Softmax GlobalAveragePool GlobalMaxPool"""
+WIDE = {"kernel_shape": [2, 3], "strides": [2, 1]}
+PADDED = {"kernel_shape": [3, 3], "pads": [1, 0, 1, 2]}
+HALVED = {"kernel_shape": [2, 2], "strides": [2, 2]}
 UNARY = [
-    ("Relu", {}),
+    *((operator, {}) for operator in PLAIN.split()),
     ("Elu", {"alpha": 0.7}),
     ("LeakyRelu", {"alpha": 0.2}),
-    ("LeakyRelu", {}),
-    ("Selu", {}),
-    ("Sigmoid", {}),
     ("HardSigmoid", {"alpha": 0.3}),
-    ("HardSwish", {}),
-    ("Tanh", {}),
-    ("Softplus", {}),
-    ("Softsign", {}),
-    ("Abs", {}),
-    ("Neg", {}),
-    ("Exp", {}),
-    ("Erf", {}),
-    ("Sin", {}),
-    ("Cos", {}),
-    ("Identity", {}),
-    ("Dropout", {}),
-    ("Flatten", {}),
     ("Flatten", {"axis": 2}),
     ("Flatten", {"axis": 0}),
     ("Transpose", {"perm": [0, 2, 3, 1]}),
-    ("Transpose", {}),
-    ("Softmax", {}),
     ("Softmax", {"axis": 1}),
     ("ReduceMean", {"axes": [2, 3]}),
     ("ReduceMean", {"keepdims": 0}),
     ("ReduceMax", {"axes": [1], "keepdims": 0}),
-    ("GlobalAveragePool", {}),
-    ("GlobalMaxPool", {}),
-    ("MaxPool", {"kernel_shape": [2, 3], "strides": [2, 1]}),
-    ("MaxPool", {"kernel_shape": [3, 3], "pads": [1, 0, 1, 2], "dilations": [1, 2]}),
-    ("MaxPool", {"kernel_shape": [2, 2], "strides": [2, 2], "ceil_mode": 1}),
-    ("AveragePool", {"kernel_shape": [2, 3], "strides": [2, 1]}),
-    ("AveragePool", {"kernel_shape": [3, 3], "pads": [1, 0, 1, 2]}),
-    (
-        "AveragePool",
-        {"kernel_shape": [3, 3], "pads": [1, 1, 1, 1], "count_include_pad": 1},
-    ),
-    (
-        "AveragePool",
-        {"kernel_shape": [2, 2], "strides": [2, 2], "auto_pad": "SAME_LOWER"},
-    ),
+    ("MaxPool", WIDE),
+    ("MaxPool", PADDED | {"dilations": [1, 2]}),
+    ("MaxPool", HALVED | {"ceil_mode": 1}),
+    ("AveragePool", WIDE),
+    ("AveragePool", PADDED),
+    ("AveragePool", PADDED | {"pads": [1, 1, 1, 1], "count_include_pad": 1}),
+    ("AveragePool", HALVED | {"auto_pad": "SAME_LOWER"}),
 ]
 
 
@@ -107,21 +87,15 @@ def test_other_versions(operator, opset, attributes, rng):
 def test_two_inputs(operator, rng):
     x = rng.normal(size=(2, 3, 5, 7)).astype("f4")
     single(operator, x, [rng.normal(size=(3, 1, 7)).astype("f4")])
-    whole = rng.integers(-9, 9, (2, 5))
-    single(operator, whole, [integers(3)])
+    single(operator, rng.integers(-9, 9, (2, 5)), [integers(3)])
+    for unary in ("Log", "Sqrt", "Reciprocal"):
+        single(unary, np.abs(x) + 0.1)
 
 
-@pytest.mark.parametrize("operator", ["Log", "Sqrt", "Reciprocal"])
-def test_positive_numbers(operator, rng):
-    single(operator, rng.uniform(0.5, 2, (2, 3)).astype("f4"))
-
-
-HALF = {"mode": "linear", "coordinate_transformation_mode": "half_pixel"}
-FLOOR = {
-    "mode": "nearest",
-    "coordinate_transformation_mode": "asymmetric",
-    "nearest_mode": "floor",
-}
+MODE = "coordinate_transformation_mode"
+MODES = ("half_pixel", "align_corners", "asymmetric", "pytorch_half_pixel")
+HALF = {"mode": "linear", MODE: "half_pixel"}
+FLOOR = {"mode": "nearest", MODE: "asymmetric", "nearest_mode": "floor"}
 CONSTANTS = [
     ("Pow", [np.float32(2.0)], {}),
     ("PRelu", [np.full((3, 1, 1), 0.3, "f4")], {}),
@@ -155,63 +129,42 @@ def test_constant_inputs(operator, constants, attributes, rng):
     single(operator, x, constants, **attributes)
 
 
-@pytest.mark.parametrize("scale", [0.5, 0.3, 0.7, 1.7, 3.0])
+@pytest.mark.parametrize("scale", [0.3, 0.7, 1.7, 3.0])
 @pytest.mark.parametrize(
     "attributes",
-    [
-        HALF,
-        FLOOR,
-        HALF | {"coordinate_transformation_mode": "align_corners"},
-        HALF | {"coordinate_transformation_mode": "asymmetric"},
-        HALF | {"coordinate_transformation_mode": "pytorch_half_pixel"},
-    ],
+    [FLOOR, *(HALF | {MODE: name} for name in MODES)],
 )
 def test_resize_by_scales_that_do_not_divide(attributes, scale, rng):
     """The scale is used as given, and 10 times float32(0.7) is 7 in float32."""
     x = rng.normal(size=(2, 3, 10, 33)).astype("f4")
     scales = np.array([1, 1, scale, 0.9 * scale], "f4")
     single("Resize", x, [None, scales], **attributes)
+    if scale == 3 and attributes in (HALF, FLOOR):  # reads at asymmetric places
+        single("Upsample", x, [scales], opset=9, mode=attributes["mode"])
 
 
-@pytest.mark.parametrize("mode", ["nearest", "linear"])
-def test_upsample_reads_at_asymmetric_places(mode, rng):
-    x = rng.normal(size=(1, 2, 5, 7)).astype("f4")
-    scales = np.array([1, 1, 2, 3], "f4")
-    single("Upsample", x, [scales], opset=9, mode=mode)
+PYTORCH = HALF | {MODE: "pytorch_half_pixel"}
+ASPECT = HALF | {"keep_aspect_ratio_policy": "not_larger"}
+CUBIC = {"mode": "cubic", "name": "up"}
+TWICE = np.float32([1, 1, 2, 2])
+POOL = {"kernel_shape": [1, 1], "strides": [3, 3], "ceil_mode": 1}
+INFINITY = np.float32(np.inf)
 
 
 @pytest.mark.parametrize(
     ("operator", "constants", "opset", "attributes", "message"),
     [
-        (
-            "Resize",
-            [None, None, integers(1, 1, 1, 4)],
-            17,
-            HALF | {"coordinate_transformation_mode": "pytorch_half_pixel"},
-            "Resize: to a size of 1 by pytorch_half_pixel",
+        ("Resize", [None, None, integers(1, 1, 1, 4)], 17, PYTORCH, "a size of 1"),
+        ("Resize", [None, None, integers(1, 1, 3, 4)], 18, ASPECT, "'not_larger'"),
+        ("Resize", [None, TWICE], 17, CUBIC, "net.onnx: node up: Resize: mode 'cubic'"),
+        ("Resize", [TWICE], 10, {}, "set 10.* 11"),
+        *(
+            ("Resize", [None, np.float32([1, 1, 2, bad])], 17, HALF, "net.onnx: .*Resi")
+            for bad in (np.inf, np.nan, 3e38, 1e-40, 0, -2)
         ),
-        (
-            "Resize",
-            [None, None, integers(1, 1, 3, 4)],
-            18,
-            HALF | {"keep_aspect_ratio_policy": "not_larger"},
-            "keep_aspect_ratio_policy = 'not_larger' is not supported",
-        ),
-        (
-            "Resize",
-            [None, np.array([1, 1, 2, 2], "f4")],
-            17,
-            {"mode": "cubic", "name": "up"},
-            "net.onnx: node up: Resize: mode 'cubic'",
-        ),
-        ("Resize", [np.ones(4, "f4")], 10, {}, "set 10.*with operator set 11"),
-        (
-            "MaxPool",
-            [],
-            17,
-            {"kernel_shape": [1, 1], "strides": [3, 3], "ceil_mode": 1},
-            r"ceil_mode with strides \[3, 3\]",
-        ),
+        ("OneHot", [INFINITY, np.float32([0, 1])], 17, {}, "infinity"),
+        ("Reshape", [INFINITY[None]], 17, {}, "infinity"),
+        ("MaxPool", [], 17, POOL, r"ceil_mode with strides \[3, 3\]"),
     ],
 )
 def test_attributes_that_are_refused(operator, constants, opset, attributes, message):
@@ -243,20 +196,6 @@ def test_convolution(attributes, rng):
     single("Conv", x[:, :, 0], [weight[:, :, 0]])
 
 
-@pytest.mark.parametrize("axis", [-1, 0, 1])
-def test_one_hot(axis):
-    goals = integers(2, 0, -1)
-    constants = [integers(3), np.array([0.5, 2.0], "f4")]
-    node = helper.make_node("OneHot", ["x", "depth", "values"], ["y"], axis=axis)
-    made = model(
-        [node],
-        {"x": (INT64, [3])},
-        {"y": (FLOAT, None)},
-        dict(zip(("depth", "values"), constants, strict=True)),
-    )
-    check(made, goals)
-
-
 def test_products_and_norms(rng):
     x, b = rng.normal(size=(4, 5)).astype("f4"), rng.normal(size=(5, 3)).astype("f4")
     c = rng.normal(size=3).astype("f4")
@@ -269,6 +208,9 @@ def test_products_and_norms(rng):
     scale, bias, mean = (rng.normal(size=3).astype("f4") for _ in range(3))
     variance = rng.uniform(0.5, 2, 3).astype("f4")
     single("BatchNormalization", image, [scale, bias, mean, variance], epsilon=1e-3)
+    for axis in (-1, 0, 1):
+        goals = integers(2, 0, -1)
+        single("OneHot", goals, [integers(3), np.float32([0.5, 2.0])], axis=axis)
     row = rng.normal(size=5).astype("f4")
     single("LayerNormalization", image, [row, row[::-1].copy()], epsilon=1e-4)
 
@@ -276,11 +218,7 @@ def test_products_and_norms(rng):
 @pytest.mark.parametrize("direction", ["forward", "reverse", "bidirectional"])
 @pytest.mark.parametrize(
     ("operator", "gates", "attributes"),
-    [
-        ("LSTM", 4, {}),
-        ("GRU", 3, {}),
-        ("GRU", 3, {"linear_before_reset": 1}),
-    ],
+    [("LSTM", 4, {}), ("GRU", 3, {}), ("GRU", 3, {"linear_before_reset": 1})],
 )
 def test_recurrent_layers(operator, gates, attributes, direction, rng):
     count, size = 2 if direction == "bidirectional" else 1, 3
@@ -324,13 +262,3 @@ def test_shapes_computed_in_the_graph(rng):
     }
     made = model(nodes, {"x": (FLOAT, ["n", 3, 4])}, {"y": (FLOAT, None)}, constants)
     check(made, rng.normal(size=(5, 3, 4)).astype("f4"))
-
-
-def test_constant_of_no_axes(rng):
-    nodes = [
-        helper.make_node("ConstantOfShape", ["empty"], ["zero"]),
-        helper.make_node("Add", ["x", "zero"], ["y"]),
-    ]
-    constants = {"empty": integers()}
-    made = model(nodes, {"x": (FLOAT, [2])}, {"y": (FLOAT, None)}, constants)
-    check(made, rng.normal(size=2).astype("f4"))

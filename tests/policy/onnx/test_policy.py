@@ -10,23 +10,23 @@ import numpy as np
 import pytest
 import torch
 
-from mi_nerfattack.errors import InputError, SetupError
+from mi_nerfattack.errors import SetupError
 from mi_nerfattack.policy.goals import OneHotGoal
 from mi_nerfattack.policy.torch_policy import TorchPolicy
+from mi_nerfattack.scenario.policy import load_policy
 from mi_nerfattack.system.extras import install_hint
 
 onnx = pytest.importorskip("onnx", reason="the extra onnx is not installed")
 pytest.importorskip("onnxruntime", reason="the extra onnx is not installed")
 
-from helpers.onnx_models import FLOAT, both, check, model  # noqa: E402
 from onnx import helper  # noqa: E402
+from support.faults.refusals import refusals  # noqa: E402
+from support.files.policies import FLOAT, both, check, model  # noqa: E402
 
 from mi_nerfattack.policy.onnx.network import OnnxNetwork, load_onnx  # noqa: E402
 
 
 def driving_network(rng, batch="n"):
-    """Convolution, pooling, batch norm, a one-hot goal, ELU, tanh."""
-
     def normal(*shape):
         return rng.normal(0, 0.2, shape).astype("f4")
 
@@ -56,22 +56,21 @@ def test_a_driving_network_and_its_derivatives(rng, variant, tmp_path):
     onnx.save(made, path)
     network = load_onnx(path)
     assert network.batch is None and not list(network.parameters())
+    assert OnnxNetwork(driving(1), "net.onnx").batch == 1
     image = rng.random((3, 8, 10, 3)).astype("f4")
     goal = np.float32([[1, 0], [0, 1], [0, 1]])
     check(made, image.transpose(0, 3, 1, 2).copy(), goal)
     policy = TorchPolicy(network, OneHotGoal(2))
-    weight = mi.Float(1.0, -2.0, 0.5)
-    control, gradient = policy.vjp(mi.TensorXf(image), [0, 1, 1], weight)
+    weight = np.array([1.0, -2.0, 0.5])
+    control, gradient = policy.vjp(mi.TensorXf(image), [0, 1, 1], mi.Float(weight))
     expected, _ = both(made, image.transpose(0, 3, 1, 2).copy(), goal)
     np.testing.assert_allclose(control, expected[0][:, 0], atol=1e-6)
-    policy = TorchPolicy(network.double(), OneHotGoal(2))
-    direction = rng.normal(size=image.shape)
+    network, direction = network.double(), rng.normal(size=image.shape)
 
     def objective(step):
         moved = torch.from_numpy(image + step * direction).permute(0, 3, 1, 2)
         with torch.no_grad():
-            result = network(moved, torch.from_numpy(goal))[0][:, 0]
-        return float(result @ torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64))
+            return network(moved, torch.from_numpy(goal))[0][:, 0].numpy() @ weight
 
     numeric = (objective(1e-5) - objective(-1e-5)) / 2e-5
     products = gradient.numpy() * direction
@@ -79,48 +78,38 @@ def test_a_driving_network_and_its_derivatives(rng, variant, tmp_path):
     assert np.sum(products) == pytest.approx(numeric, abs=1e-6 * scale)
 
 
-def refused(made, tmp_path, match):
-    path = tmp_path / "net.onnx"
-    path.write_bytes(made.SerializeToString())
-    with pytest.raises(InputError, match=match):
-        load_onnx(path)
+def two_outputs(rng):
+    """An angle (n, 1) and a throttle (n, 2), in this order."""
+    weights = {"a": rng.normal(0, 1, (12, 1)), "t": rng.normal(0, 1, (12, 2))}
+    nodes = [
+        helper.make_node("Flatten", ["image"], ["f"]),
+        helper.make_node("MatMul", ["f", "a"], ["angle"]),
+        helper.make_node("MatMul", ["f", "t"], ["throttle"]),
+    ]
+    outputs = {"angle": (FLOAT, ["n", 1]), "throttle": (FLOAT, ["n", 2])}
+    values = {name: value.astype("f4") for name, value in weights.items()}
+    inputs = {"image": (FLOAT, ["n", 3, 2, 2])}
+    return model(nodes, inputs, outputs, values), values
 
 
-def test_unsupported_operators_are_named(tmp_path):
-    node = helper.make_node("Hardmax", ["x"], ["z"])
-    other = helper.make_node("Det", ["z"], ["y"])
-    made = model([node, other], {"x": (FLOAT, [1, 3, 3])}, {"y": (FLOAT, [1])})
-    refused(made, tmp_path, r"net.onnx: operators Det, Hardmax.*Conv")
-
-
-def test_damaged_files_are_refused(tmp_path, rng):
-    path = tmp_path / "net.onnx"
-    path.write_bytes(b"no model at all")
-    with pytest.raises(InputError, match=r"net.onnx: is no ONNX model"):
-        load_onnx(path)
-    with pytest.raises(InputError, match="absent.onnx.*does not exist"):
-        load_onnx(tmp_path / "absent.onnx")
-    whole = driving_network(rng).SerializeToString()
-    path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match=r"net.onnx: is no ONNX model"):
-        load_onnx(path)
-
-
-def test_weights_in_other_files_are_refused(tmp_path, rng):
-    path = tmp_path / "net.onnx"
-    onnx.save(driving_network(rng), path, save_as_external_data=True, size_threshold=0)
-    with pytest.raises(InputError, match="'w0' in another file"):
-        load_onnx(path)
-
-
-def test_wrong_inputs_are_named(rng):
-    network = OnnxNetwork(driving_network(rng), "net.onnx")
-    goal = torch.eye(2)
-    with pytest.raises(InputError, match=r"\['image', 'goal'\].*are 1: set policy.go"):
-        network(torch.rand(2, 3, 8, 10))
-    with pytest.raises(InputError, match=r"\(any, 3, 8, 10\).*= \[10, 8\]"):
-        network(torch.rand(2, 3, 9, 10), goal)
-    assert OnnxNetwork(driving_network(rng, 1), "net.onnx").batch == 1
+@pytest.mark.parametrize(
+    ("keys", "weight", "column"),
+    [
+        ({"output_name": "angle"}, "a", 0),
+        ({"output_name": "throttle", "output": 1}, "t", 1),
+    ],
+)
+def test_an_output_is_chosen_by_name(keys, weight, column, rng, variant, tmp_path):
+    made, weights = two_outputs(rng)
+    onnx.save(made, tmp_path / "net.onnx")
+    policy = load_policy({"file": "net.onnx", **keys}, tmp_path)
+    image = rng.random((3, 2, 2, 3)).astype("f4")
+    flat = image.transpose(0, 3, 1, 2).reshape(3, 12)
+    control, d_image = policy.vjp(mi.TensorXf(image), 0, mi.Float(0, 1, 0))
+    np.testing.assert_allclose(control, flat @ weights[weight][:, column], rtol=1e-5)
+    expected = weights[weight][:, column].reshape(3, 2, 2).transpose(1, 2, 0)
+    np.testing.assert_allclose(d_image.numpy()[1], expected, rtol=1e-6)
+    assert not d_image.numpy()[[0, 2]].any()
 
 
 def test_without_the_extra(tmp_path, monkeypatch):
@@ -130,21 +119,58 @@ def test_without_the_extra(tmp_path, monkeypatch):
         load_onnx(tmp_path / "net.onnx")
 
 
-def test_data_of_constants_in_other_files_are_refused(tmp_path):
-    value = onnx.numpy_helper.from_array(np.ones(2, "f4"), "k")
-    value.ClearField("raw_data")
-    value.data_location = onnx.TensorProto.EXTERNAL
-    value.external_data.add(key="location", value="weights.bin")
-    nodes = [
-        helper.make_node("Constant", [], ["k"], value=value),
-        helper.make_node("Mul", ["x", "k"], ["y"]),
-    ]
-    made = model(nodes, {"x": (FLOAT, [1, 2])}, {"y": (FLOAT, [1, 2])})
-    refused(made, tmp_path, "'k' in another file")
+def saved(make, **options):
+    def load(folder):
+        if options:
+            onnx.save(make(), folder / "net.onnx", **options)
+        else:
+            (folder / "net.onnx").write_bytes(make().SerializeToString())
+        return load_onnx(folder / "net.onnx")
+
+    return load
 
 
-def test_images_of_integers_are_refused(tmp_path):
-    node = helper.make_node("Cast", ["image"], ["y"], to=FLOAT)
-    uint8 = onnx.TensorProto.UINT8
-    made = model([node], {"image": (uint8, [1, 3, 4, 4])}, {"y": (FLOAT, [1, 3, 4, 4])})
-    refused(made, tmp_path, "'image', the image, is of integers.*preprocess.scale")
+def chosen(**keys):
+    def load(folder):
+        onnx.save(two_outputs(np.random.default_rng(0))[0], folder / "net.onnx")
+        return load_policy({"file": "net.onnx", **keys}, folder)
+
+    return load
+
+
+def driving(batch="n"):
+    return driving_network(np.random.default_rng(0), batch)
+
+
+def one_node(operator="Mul", kind=FLOAT, constant=None, **attributes):
+    """Make a model of one operator, whose second input may be in another file."""
+    nodes = [helper.make_node(operator, ["image", "k"][: 1 + bool(constant)], ["y"])]
+    nodes[0].attribute.extend(helper.make_attribute(*a) for a in attributes.items())
+    if constant:
+        value = onnx.numpy_helper.from_array(np.ones(2, "f4"), constant)
+        value.ClearField("raw_data")
+        value.data_location = onnx.TensorProto.EXTERNAL
+        value.external_data.add(key="location", value="weights.bin")
+        nodes.insert(0, helper.make_node("Constant", [], [constant], value=value))
+    return lambda: model(nodes, {"image": (kind, [1, 2])}, {"y": (FLOAT, [1, 2])})
+
+
+def applied(shape, *goal):
+    return lambda: OnnxNetwork(driving(), "net.onnx")(torch.rand(shape), *goal)
+
+
+UINT8 = onnx.TensorProto.UINT8
+OTHERS = {"save_as_external_data": True, "size_threshold": 0}
+TWO = "'angle', 'throttle'"
+test_refused = refusals(
+    (saved(one_node("Hardmax")), "net.onnx: operators Hardmax.*Conv"),
+    (saved(driving, **OTHERS), "'w0' in another file"),
+    (saved(one_node(constant="k")), "'k' in another file"),
+    (saved(one_node("Cast", UINT8, to=FLOAT)), "'image', .*preprocess.scale"),
+    (lambda folder: load_onnx(folder / "absent.onnx"), "absent.onnx.*does not exist"),
+    (applied((2, 3, 8, 10)), r"\['image', 'goal'\].*policy.go"),
+    (applied((2, 3, 9, 10), torch.eye(2)), r"\(any, 3, 8, 10\).*= \[10, 8\]"),
+    (chosen(), f"{TWO}, and policy.output_name is None"),
+    (chosen(output_name="steer"), f"{TWO}.* is 'steer'"),
+    (chosen(output_name="angle", recurrent=[[-1, 2]] * 2), "must be 2 hidden states"),
+)

@@ -2,51 +2,37 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers.kernels import nothing_compiled
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from support.files import folders as foreign_folders
+from support.reference.derivatives import nothing_compiled
+from support.worlds.cameras import NARROW, RADIAL, WIDE, directions, pixels
+from support.worlds.views import write_transforms
 
 from mi_nerfattack.backend import colour
+from mi_nerfattack.capture.coverage import points_shown
+from mi_nerfattack.capture.transforms import read_images
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.render.camera import distortion, lens
 from mi_nerfattack.render.camera import intrinsics as cam
 from mi_nerfattack.render.camera.conventions import mitsuba_sensor_dict
-from mi_nerfattack.render.camera.distortion import distort, undistort
-
-FOX = cam.Camera(
-    1080,
-    1920,
-    1375.52,
-    1374.49,
-    554.558,
-    965.268,
-    k1=0.0578421,
-    k2=-0.0805099,
-    p1=-0.000980296,
-    p2=0.00015575,
-)
-
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 
-def random_poses(n: int, seed: int = 0) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    poses = np.tile(np.eye(4), (n, 1, 1))
-    poses[:, :3, :3] = Rotation.random(n, rng=seed).as_matrix()
-    poses[:, :3, 3] = np.random.default_rng(seed).normal(size=(n, 3)) * 5
-    return poses
+POSE = cam.look_at([3.0, -2, 1], [0.5, 0.2, 0.4])
+POSE[:3, :3] = POSE[:3, [1, 2, 0]]  # askew
 
 
-def rays_of(camera, poses, **kwargs):
-    origin, rotation = cam.pose_arrays(poses)
-    o, d = cam.generate_rays(camera, origin, rotation, len(poses), **kwargs)
-    shape = (len(poses), camera.height, camera.width, 3)
-    return o.numpy().T.reshape(shape), d.numpy().T.reshape(shape)
+def rays_of(camera, **kwargs):
+    """Return origins (3, n) and directions (h, w, 3)."""
+    o, d = lens.generate_rays(camera, *lens.pose_arrays(POSE), 1, **kwargs)
+    return o.numpy(), d.numpy().T.reshape(camera.height, camera.width, 3)
 
 
 @pytest.mark.parametrize("eye", [(3.0, -2.0, 5.0), (0.0, 0.0, 4.0), (1.0, 0.0, 0.0)])
@@ -75,7 +61,7 @@ def test_mount_pose_agrees_with_matrix():
     states = np.random.default_rng(1).normal(size=(7, 3)) * [10, 10, 3]
     mount = cam.CameraMount(1.2, -0.3, 12.0)
     columns = tuple(mi.Float(np.float32(column)) for column in states.T)
-    origin, rotation = cam.mount_pose(columns, 1.2, -0.3, 12.0)
+    origin, rotation = lens.mount_pose(columns, 1.2, -0.3, 12.0)
     matrix = cam.mount_matrix(states, mount)
     np.testing.assert_allclose(origin.numpy().T, matrix[:, :3, 3], atol=1e-5)
     for i, column in enumerate(rotation):
@@ -83,64 +69,53 @@ def test_mount_pose_agrees_with_matrix():
 
 
 @pytest.mark.parametrize(
-    "lens",
-    [
-        (11.0, 11.0, 10.0, 6.0),
-        (11.0, 11.0, 7.5, 8.25),
-        (11.0, 12.5, 7.5, 8.25),
-        (20.0, 20.0, 10.0, 6.0, -0.2, 0.05, 3e-3, -2e-3),
-    ],
+    "lens", [(11.0, 11.0, 7.5, 8.25), (20.0, 22.0, 10.0, 6.0, -0.2, 0.05, 3e-3, -2e-3)]
 )
 def test_rays_agree_with_mitsubas_sensor(lens):
     camera = cam.Camera(20, 12, *lens)
-    poses = random_poses(3)
-    origins, directions = rays_of(camera, poses)
+    origin, directions = rays_of(camera)
     row, column = np.mgrid[0:12, 0:20]
-    film = mi.Point2f(
-        mi.Float(((column + 0.5) / 20).ravel()), mi.Float(((row + 0.5) / 12).ravel())
-    )
-    for i, pose in enumerate(poses):
-        sensor = mi.load_dict(mitsuba_sensor_dict(camera, pose, 1))
-        ray, _ = sensor.sample_ray(0.0, 0.0, film, mi.Point2f(0))
-        ours = directions[i].reshape(-1, 3)
-        np.testing.assert_allclose(ray.d.numpy().T, ours, atol=2e-6)
-        # the sensor starts its rays at the near plane: on our ray, but further
-        offset = ray.o.numpy().T - origins[i].reshape(-1, 3)
-        np.testing.assert_allclose(np.cross(offset, ours), 0, atol=1e-5)
+    place = np.stack([(column + 0.5) / 20, (row + 0.5) / 12]).reshape(2, -1)
+    sensor = mi.load_dict(mitsuba_sensor_dict(camera, POSE, 1))
+    film = mi.Point2f(place.astype(np.float32))
+    ray, _ = sensor.sample_ray(0.0, 0.0, film, mi.Point2f(0))
+    ours = directions.reshape(-1, 3)
+    np.testing.assert_allclose(ray.d.numpy().T, ours, atol=2e-6)
+    # the sensor starts its rays at the near plane: on our ray, but further
+    np.testing.assert_allclose(np.cross((ray.o.numpy() - origin).T, ours), 0, atol=1e-5)
 
 
 def test_subpixel_moves_the_sample():
-    camera = cam.from_fov(4, 2, 90.0)
-    _, directions = rays_of(camera, np.eye(4)[None], subpixel=mi.Point2f(0.5, -0.5))
-    np.testing.assert_allclose(
-        directions[0, 0, 0, :2] / directions[0, 0, 0, 2], [-0.5, -0.5], atol=1e-6
-    )
+    _, directions = rays_of(cam.from_fov(4, 2, 90.0), subpixel=mi.Point2f(0.5, -0.5))
+    x, y, z = directions[0, 0] @ POSE[:3, :3]
+    np.testing.assert_allclose([x / z, y / z], [-0.5, -0.5], atol=1e-6)
 
 
 @pytest.mark.parametrize("wrt", [0, 1, 2])
-def test_rays_derivative_in_the_state(wrt):
+def test_rays_derivative_in_the_state(rng, wrt):
     camera = cam.from_fov(6, 4, 80.0)
-    rng = np.random.default_rng(3)
-    weight_o = mi.Point3f(mi.TensorXf(np.float32(rng.normal(size=(3, 24)))))
-    weight_d = mi.Point3f(mi.TensorXf(np.float32(rng.normal(size=(3, 24)))))
+    weights = rng.normal(size=(6, 24)).astype(np.float32)
 
-    def objective(values):
-        state = tuple(mi.Float(v) for v in values)
-        dr.enable_grad(state)
-        o, d = cam.generate_rays(camera, *cam.mount_pose(state, 1.4, 0.5, 6.0), 1)
-        return dr.sum(dr.dot(o, weight_o) + dr.dot(d, weight_d)), state
+    def objective(value):
+        state = [mi.Float(v) for v in (1.0, 2.0, 0.7)]
+        state[wrt] = mi.Float(value)
+        o, d = lens.generate_rays(
+            camera, *lens.mount_pose(tuple(state), 1.4, 0.5, 6), 1
+        )
+        rows = zip((*o, *d), weights, strict=True)
+        return dr.sum(sum(row * mi.Float(weight) for row, weight in rows))
 
-    point, step = np.array([1.0, 2.0, 0.7]), 1e-2
-    value, state = objective(point)
-    dr.backward(value)
-    delta = np.eye(3)[wrt] * step
-    numeric = (objective(point + delta)[0] - objective(point - delta)[0]) / (2 * step)
-    np.testing.assert_allclose(dr.grad(state[wrt])[0], numeric[0], rtol=1e-3, atol=1e-3)
+    base = (1.0, 2.0, 0.7)[wrt]
+    value = mi.Float(base)
+    dr.enable_grad(value)
+    dr.backward(objective(value))
+    numeric = (objective(base + 1e-2) - objective(base - 1e-2))[0] / 2e-2
+    np.testing.assert_allclose(dr.grad(value)[0], numeric, rtol=1e-3, atol=1e-3)
 
 
 def test_no_kernel_is_compiled_for_another_pose_or_lens():
     def frame(camera, state):
-        o, d = cam.generate_rays(camera, *cam.mount_pose(state, 1.4, 0.5, 6.0), 1)
+        o, d = lens.generate_rays(camera, *lens.mount_pose(state, 1.4, 0.5, 6.0), 1)
         dr.eval(o, d)
 
     frame(cam.from_fov(31, 17, 90.0), tuple(dr.opaque(mi.Float, v) for v in (0, 0, 0)))
@@ -151,88 +126,142 @@ def test_no_kernel_is_compiled_for_another_pose_or_lens():
 
 
 def test_wrong_number_of_poses():
-    origin, rotation = cam.pose_arrays(random_poses(2))
     with pytest.raises(ValueError, match="2 entries; n_poses is 3"):
-        cam.generate_rays(cam.from_fov(2, 2, 90.0), origin, rotation, 3)
+        arrays = lens.pose_arrays(np.stack([POSE, POSE]))
+        lens.generate_rays(cam.from_fov(2, 2, 90.0), *arrays, 3)
 
 
-def test_distorted_rays_project_back_with_opencv():
-    import cv2
-
-    camera = FOX.resized(27, 48)
-    _, directions = rays_of(camera, np.eye(4)[None])
-    matrix = np.array(
-        [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]]
-    )
-    points, _ = cv2.projectPoints(
-        directions.reshape(-1, 3).astype(np.float64),
-        np.zeros(3),
-        np.zeros(3),
-        matrix,
-        np.array(camera.distortion),
-    )
-    row, column = np.mgrid[0:48, 0:27] + 0.5
-    np.testing.assert_allclose(
-        points[:, 0], np.stack([column.ravel(), row.ravel()], 1), atol=1e-4
-    )
-
-
-@settings(max_examples=50)
-@given(
-    x=st.floats(-0.6, 0.6),
-    y=st.floats(-0.6, 0.6),
-    k=st.tuples(*[st.floats(-0.1, 0.1)] * 2, *[st.floats(-0.01, 0.01)] * 2),
-)
-def test_undistort_inverts_distort(x, y, k):
-    np.testing.assert_allclose(undistort(*distort(x, y, *k), *k), (x, y), atol=1e-9)
+GOOD = {"width": 10, "height": 10, "fx": 10.0, "fy": 10.0, "cx": 5.0, "cy": 5.0}
 
 
 @pytest.mark.parametrize(
-    ("change", "name"),
+    ("kind", "name", "value"),
     [
-        ({"width": 0}, "camera.width"),
-        ({"width": 5.0}, "camera.width: 5.0; must be an int"),
-        ({"height": 2.5}, "camera.height: 2.5; must be an int"),
-        ({"fx": -1.0}, "camera.fx"),
-        ({"cx": float("nan")}, "camera.cx"),
-        ({"k1": -5.0}, "camera.k1"),
+        (cam.Camera, "width", 0),
+        (cam.Camera, "width", 5.0),
+        (cam.Camera, "fx", -1.0),
+        (cam.Camera, "cx", np.nan),
+        (cam.Camera, "k1, k2, p1, p2", -5.0),
+        (cam.CameraMount, "height_m", np.nan),
+        (cam.CameraMount, "pitch_deg", -np.inf),
     ],
 )
-def test_impossible_cameras(change, name):
-    values = {"width": 10, "height": 10, "fx": 10.0, "fy": 10.0, "cx": 5.0, "cy": 5.0}
-    with pytest.raises(InputError, match=name):
-        cam.Camera(**{**values, **change})
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("height_m", np.nan), ("forward_m", np.inf), ("pitch_deg", -np.inf)],
-)
-def test_impossible_mounts(name, value):
-    with pytest.raises(InputError, match=f"mount.{name}: -?(nan|inf); must be finite"):
-        cam.CameraMount(**{name: value})
+def test_impossible_cameras_and_mounts(kind, name, value):
+    good, prefix = (GOOD, "camera") if kind is cam.Camera else ({}, "mount")
+    with pytest.raises(InputError) as caught:
+        kind(**{**good, name.partition(",")[0]: value})
+    assert caught.value.where == f"{prefix}.{name}"
 
 
 def test_srgb_known_values():
     # IEC 61966-2-1: 8-bit 188 is about half the light, 118 is 18 % grey
     codes = colour.linear_to_uint8(np.array([0.0, 0.5, 0.18, 1.0, 7.0, -1.0]))
     np.testing.assert_array_equal(codes, [0, 188, 118, 255, 255, 0])
+    with pytest.raises(ValueError, match="NaN"):
+        colour.linear_to_uint8(np.array([float("nan")]))
 
 
 def test_srgb_round_trip_and_numpy_agree():
     values = np.linspace(0, 1, 1001, dtype=np.float32)
-    encoded = dr.linear_to_srgb(mi.Float(values))
-    np.testing.assert_allclose(dr.srgb_to_linear(encoded), values, atol=1e-6)
-    np.testing.assert_allclose(
-        encoded, colour.linear_to_srgb_numpy(values.astype(float)), atol=1e-6
-    )
-    np.testing.assert_allclose(
+    encoded, decoded = (
+        dr.linear_to_srgb(mi.Float(values)),
         dr.srgb_to_linear(mi.Float(values)),
-        colour.srgb_to_linear_numpy(values.astype(float)),
-        atol=1e-6,
     )
+    for found, expected in (
+        (dr.srgb_to_linear(encoded), values),
+        (encoded, colour.linear_to_srgb_numpy(values.astype(float))),
+        (decoded, colour.srgb_to_linear_numpy(values.astype(float))),
+    ):
+        np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-def test_eight_bits_refuse_nan():
-    with pytest.raises(ValueError, match="NaN"):
-        colour.linear_to_uint8(np.array([float("nan")]))
+# Lenses with distortion, also fisheyes
+
+
+@pytest.mark.parametrize("camera", [NARROW, WIDE, RADIAL], ids=["narrow", "wide", "no"])
+def test_rays_look_where_the_lens_says(camera):
+    pose = cam.look_at([1.0, 2, 3], [0, 0, 0])
+    _, direction = lens.generate_rays(camera, *lens.pose_arrays(pose), 1)
+    local = direction.numpy().T @ pose[:3, :3]
+    np.testing.assert_allclose(local, directions(camera, *pixels(camera)), atol=2e-6)
+    assert (local[:, 2] < 0).any() == (camera is WIDE)
+    lengths = cam.ray_lengths(camera).ravel()
+    ahead = local[:, 2] > 0.01
+    np.testing.assert_allclose(lengths[ahead], 1 / local[ahead, 2], rtol=1e-3)
+    assert np.isnan(lengths[local[:, 2] < -0.01]).all()
+
+
+@pytest.mark.parametrize("camera", [NARROW, RADIAL], ids=["fisheye", "radial"])
+def test_opencv_projects_rays_back_to_their_pixels(camera):
+    cv2 = pytest.importorskip("cv2")
+    x, y = cam.ray_slopes(camera)
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    points = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 1, 3)
+    project = cv2.fisheye.projectPoints if camera.is_fisheye else cv2.projectPoints
+    zero, coefficients = np.zeros(3), np.array(camera.distortion[:4])
+    found, _ = project(points, zero, zero, matrix, coefficients)
+    np.testing.assert_allclose(found[:, 0].T, pixels(camera), atol=1e-6)
+    # distort is the same projection, and jacobian its derivative
+    bent = np.reshape(distortion.distort(x, y, *camera.distortion), (2, -1))
+    scaled = bent * [[camera.fx], [camera.fy]] + [[camera.cx], [camera.cy]]
+    np.testing.assert_allclose(scaled, pixels(camera), atol=1e-6)
+    xx, xy, yy, determinant = distortion.jacobian(x, y, *camera.distortion)
+    step = 1e-6
+    for dx, dy, expected in ((step, 0, (xx, xy)), (0, step, (xy, yy))):
+        ahead = distortion.distort(x + dx, y + dy, *camera.distortion)
+        back = distortion.distort(x - dx, y - dy, *camera.distortion)
+        slope = (np.array(ahead) - np.array(back)) / (2 * step)
+        np.testing.assert_allclose(slope, expected, atol=1e-7)
+    np.testing.assert_allclose(determinant, xx * yy - xy * xy, rtol=1e-12)
+
+
+# Files, and what is refused
+
+
+def test_files_come_back(tmp_path):
+    images = np.zeros((3, 48, 64, 3), np.uint8)
+    poses = np.stack([cam.look_at([3.0, i, 1], [0, 0, 0]) for i in range(3)])
+    write_transforms(tmp_path, images, WIDE, poses)
+    back = read_images(tmp_path)
+    assert back.camera == WIDE and not back.cameras
+    smaller = read_images(tmp_path, 32).camera
+    assert smaller == WIDE.resized(32, 24)
+
+
+def test_a_fisheye_of_instant_ngp(tmp_path):
+    source = foreign_folders.instant_ngp(tmp_path) / "transforms.json"
+    table = json.loads(source.read_text())
+    table |= {"is_fisheye": True, "k1": 0.01, "k2": 0.0, "k3": 0.002, "k4": -0.001}
+    source.write_text(json.dumps(table | {"p1": 0.0, "p2": 0.0}))
+    assert read_images(source).camera.distortion == (0.01, 0.0, 0.002, -0.001, True)
+    source.write_text(json.dumps(table | {"p1": 0.01, "p2": 0.0}))
+    with pytest.raises(InputError, match="camera.p1: 0.01; a fisheye has 0"):
+        read_images(source)
+
+
+@pytest.mark.parametrize(
+    ("call", "where"),
+    [
+        (lambda: replace(NARROW, k1=-0.6), "camera.k1, k2, k3, k4"),
+        (lambda: replace(NARROW, fx=8.0, fy=8.0), "camera.k1, k2, k3, k4"),  # over 180
+        (lambda: replace(NARROW, is_fisheye=False), "camera.k3"),
+        (lambda: cam.ray_slopes(WIDE), "camera"),
+        (
+            lambda: lens.Lens([NARROW, cam.Camera(64, 48, 30.0, 32.0, 31.0, 25.0)]),
+            "cameras",
+        ),
+    ],
+)
+def test_what_no_such_lens_is(call, where):
+    with pytest.raises(InputError) as caught:
+        call()
+    assert caught.value.where == where
+
+
+def test_points_beside_the_picture_are_not_shown():
+    """A pinhole of this focal length would show 47 degrees, the fisheye 61."""
+    pose = np.eye(4)[None]
+    inside, outside = np.radians([55.0, 65.0])
+    points = np.array([[np.sin(a), 0, np.cos(a)] for a in (inside, outside)])
+    points = np.r_[points, [[0, 0, -1.0]]]
+    assert points_shown([NARROW], pose, points).tolist() == [[True, False, False]]

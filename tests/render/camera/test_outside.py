@@ -13,24 +13,18 @@ from mi_nerfattack.render.camera.outside import Overhead, chase_mount, seen_at
 POINTS = np.array([[-10.0, -3.0], [30.0, 5.0], [4.0, 17.0]])
 
 
-def test_a_map_to_scale_frames_points():
+def test_a_map_to_scale_is_what_the_camera_sees():
+    """By the equation of a pinhole; what is high moves outwards a little."""
     overhead = Overhead.covering(POINTS, 2.0, 110)
     assert (overhead.width, overhead.height) == (110, 60)
     assert overhead.extent == pytest.approx((-12, 32, -5, 19))
-    np.testing.assert_allclose(
-        overhead.to_px(POINTS), [[5, 55], [105, 35], [40, 5]], atol=1e-9
-    )
-
-
-def test_the_camera_sees_what_the_map_says():
-    """By the equation of a pinhole; what is high moves outwards a little."""
-    overhead = Overhead.covering(POINTS, 2.0, 110)
+    on_map = overhead.to_px(POINTS)
+    np.testing.assert_allclose(on_map, [[5, 55], [105, 35], [40, 5]], atol=1e-9)
     pose, ground = overhead.camera_to_world, np.pad(POINTS, ((0, 0), (0, 1)))
     found = seen_at(overhead.camera, pose, ground)
-    np.testing.assert_allclose(found, overhead.to_px(POINTS), atol=1e-6)
+    np.testing.assert_allclose(found, on_map, atol=1e-6)
     raised = seen_at(overhead.camera, pose, ground + [0, 0, 10.0])
-    middle = [55.0, 30.0]
-    growth = (raised - middle) / (found - middle)
+    growth = (raised - [55, 30]) / (found - [55, 30])
     np.testing.assert_allclose(growth, 1 / (1 - 10 / overhead.height_m))
 
 
@@ -51,29 +45,26 @@ def test_from_behind_the_car_is_in_the_middle_and_the_road_ahead():
 @pytest.mark.usefixtures("variant")
 def test_a_room_is_seen_below_its_ceiling():
     """A red mat lies 2 m right of the middle, and 1 m above it in the picture."""
-    place = mi.ScalarTransform4f()
 
-    def plate(z, x, y, half, colour, up):
-        turn = place.translate([x, y, z]).rotate([1, 0, 0], 0 if up else 180)
+    def plate(z, x, y, half, colour, turned_deg):
+        place = mi.ScalarTransform4f().translate([x, y, z])
+        place = place.rotate([1, 0, 0], turned_deg).scale(half)
         bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": colour}}
-        shape = {"type": "rectangle", "to_world": turn.scale(half)}
-        return {**shape, "bsdf": {"type": "twosided", "bsdf": bsdf}}
+        return {"type": "rectangle", "to_world": place, "bsdf": bsdf}
 
     scene = mi.load_dict(
         {
             "type": "scene",
             "integrator": {"type": "direct"},
             "light": {"type": "point", "position": [0, 0, 2.5], "intensity": 20.0},
-            "floor": plate(0.0, 0, 0, 5.0, [0.2, 0.2, 0.2], True),
-            "mat": plate(0.01, 2, 1, 0.5, [0.9, 0.0, 0.0], True),
-            "ceiling": plate(3.0, 0, 0, 5.0, [0.0, 0.9, 0.0], False),
+            "floor": plate(0.0, 0, 0, 5.0, [0.2, 0.2, 0.2], 0),
+            "mat": plate(0.01, 2, 1, 0.5, [0.9, 0.0, 0.0], 0),
+            "ceiling": plate(3.0, 0, 0, 5.0, [0.0, 0.9, 0.0], 180),
         }
     )
-    corners = np.array([[-4.0, -3.0], [4.0, 3.0]])
-    overhead = Overhead.covering(corners, 0.0, 80)
+    overhead = Overhead.covering(np.array([[-4.0, -3.0], [4.0, 3.0]]), 0.0, 80)
     image = scene_above(scene, overhead, np.zeros((1, 2)), spp=4).image.astype(int)
     assert image.shape == (60, 80, 3)
-    red = image[..., 0] > 2 * image[..., 2] + 20
-    rows, columns = np.nonzero(red)
-    assert rows.min() == 15 and rows.max() == 24
-    assert columns.min() == 55 and columns.max() == 64
+    rows, columns = np.nonzero(image[..., 0] > 2 * image[..., 2] + 20)
+    assert (rows.min(), rows.max()) == (15, 24)
+    assert (columns.min(), columns.max()) == (55, 64)

@@ -1,1 +1,0 @@
-"""Figures of vehicles, experts, collecting and DAgger."""

@@ -1,1 +1,0 @@
-"""`bench gpu`: everything that is measured, on an NVIDIA GPU beside PyTorch there."""

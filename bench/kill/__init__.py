@@ -1,1 +1,0 @@
-"""Kill attacks at random moments and resume them."""

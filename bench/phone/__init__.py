@@ -1,1 +1,0 @@
-"""A made phone video of the bundled room, through the whole chain."""

@@ -1,1 +1,0 @@
-"""Thousands of iterations of one attack, watched for growth and drift."""

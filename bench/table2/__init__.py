@@ -1,1 +1,0 @@
-"""Table 2 of the paper beside our figures."""

@@ -1,0 +1,165 @@
+"""Finished drives: a file each, by all that decides about the drive."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import quote
+
+from mi_nerfattack.drives.spec import FORMAT, DriveSpec
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
+from mi_nerfattack.io.resumable import Record, Unit, misfits_told
+from mi_nerfattack.rollout.drive import Drive
+
+_REMEDY = "remove the file"
+
+
+class DriveRecord(Record):
+    """The labels of a kept drive, and what it cost.
+
+    Attributes:
+        environment: its label.
+        route: name.
+        case: what objects showed.
+        run: index.
+        seed: of the environment.
+        wall_s: seconds.
+    """
+
+    environment: str
+    route: str
+    case: str
+    run: int
+    seed: int
+    wall_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """A drive that is done.
+
+    Attributes:
+        drive: the drive.
+        wall_s: seconds that it took.
+    """
+
+    drive: Drive
+    wall_s: float
+
+
+@dataclass(frozen=True)
+class Store:
+    """The finished drives of a folder.
+
+    Args:
+        folder: of the files; made with the first.
+        shared: folder of drives that several such folders have in common; what is there
+            is taken over, and what is added here is added there.
+    """
+
+    folder: Path
+    shared: Path | None = None
+
+    def path(self, spec: DriveSpec) -> Path:
+        """Return the file of a drive."""
+        return self.folder / _name(spec)
+
+    def has(self, spec: DriveSpec) -> bool:
+        """Tell whether a drive is done."""
+        return self.path(spec).exists() or self._is_shared(spec)
+
+    def read(self, spec: DriveSpec) -> Finished | None:
+        """Read a drive; None where it is not done.
+
+        Raises:
+            InputError: the file is damaged.
+        """
+        unit = self._unit(self.path(spec), spec)
+        kept = unit.read()
+        if kept is None and self.shared is not None:
+            kept = self._unit(self.shared / _name(spec), spec).read()
+            if kept is not None:
+                files.make_folder(unit.path.parent)
+                unit.write(kept.tensors, kept.record)
+        if kept is None:
+            return None
+        about = spec.environment, spec.route, spec.case, spec.run, spec.seed
+        with misfits_told(unit.path):
+            return Finished(Drive(*about, **kept.tensors), kept.record.wall_s)
+
+    def add(self, spec: DriveSpec, drive: Drive, wall_s: float) -> None:
+        """Write a drive.
+
+        Args:
+            spec: of the drive.
+            drive: finished.
+            wall_s: seconds that it took.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        record = DriveRecord(
+            environment=spec.environment,
+            route=spec.route,
+            case=spec.case,
+            run=spec.run,
+            seed=spec.seed,
+            wall_s=wall_s,
+        )
+        for folder in (self.shared, self.folder):
+            if folder is not None:
+                unit = self._unit(folder / _name(spec), spec)
+                files.make_folder(unit.path.parent)
+                unit.write(drive.arrays(), record)
+
+    def remove_others(self, specs: Collection[DriveSpec]) -> None:
+        """Remove the files of all other drives."""
+        wanted = {self.path(spec) for spec in specs}
+        for path in drive_files(self.folder):
+            if path not in wanted:
+                path.unlink()
+
+    def remove(self) -> None:
+        """Remove all files, and the folders."""
+        self.remove_others(())
+        for folder in [*self.folder.glob("*"), self.folder]:
+            if folder.is_dir():
+                folder.rmdir()
+
+    def _is_shared(self, spec: DriveSpec) -> bool:
+        return self.shared is not None and (self.shared / _name(spec)).exists()
+
+    def _unit(self, path: Path, spec: DriveSpec) -> Unit[DriveRecord]:
+        return Unit(path, spec.identity, DriveRecord, _REMEDY)
+
+
+def _name(spec: DriveSpec) -> str:
+    folder = quote(spec.environment, safe="@")
+    return f"{folder}/{spec.case}_{spec.run:04d}-{spec.digest}.safetensors"
+
+
+def drive_files(folder: Path) -> list[Path]:
+    """Return the files of drives, by environment, case and run."""
+    return sorted(folder.glob("*/*.safetensors"))
+
+
+def read_drive(path: Path) -> Drive:
+    """Read a finished drive, whatever it is of.
+
+    Raises:
+        InputError: the file is missing, damaged, or of another format.
+    """
+    kept = Unit(path, {"format": FORMAT}, DriveRecord, _REMEDY).read(force=True)
+    if kept is None:
+        raise InputError(f"{path}: missing; it was removed")
+    record = kept.record
+    about = record.environment, record.route, record.case, record.run, record.seed
+    with misfits_told(path):
+        return Drive(*about, **kept.tensors)
+
+
+def read_drives(folder: Path) -> list[Drive]:
+    """Read all finished drives of a folder, see :func:`read_drive`."""
+    return [read_drive(path) for path in drive_files(folder)]

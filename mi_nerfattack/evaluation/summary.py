@@ -1,0 +1,180 @@
+"""The summary of a table of drives, by any of its columns, with intervals."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+RESAMPLES = 9999
+
+#: Ends of an interval; None where there is none.
+Interval = list[float] | None
+
+
+def share_interval(count: int, total: int) -> list[float]:
+    """Return the lower and upper end of a share's interval (Wilson).
+
+    Args:
+        count: how often something happened.
+        total: of how many times, at least 1.
+    """
+    return [*_wilson(count, total)]
+
+
+@cache
+def _wilson(count: int, total: int) -> tuple[float, float]:
+    import scipy.stats  # it takes a second
+
+    interval = scipy.stats.binomtest(count, total).proportion_ci(method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def mean_interval(values: np.ndarray, seed: int) -> Interval:
+    """Return the interval of the mean, see :func:`bootstrap_interval`.
+
+    Args:
+        values: (n,), a number for each run.
+        seed: of the resampling.
+    """
+    return bootstrap_interval(np.mean, (values,), seed)
+
+
+def interquartile_mean(values: np.ndarray, axis: int = -1) -> Any:
+    """Return the mean of what lies between the quartiles; of less than 4, the mean.
+
+    A quarter of the values, rounded down, is left out at either end.
+
+    Args:
+        values: (..., n) along the axis.
+        axis: to be averaged.
+    """
+    import scipy.stats
+
+    return scipy.stats.trim_mean(values, 0.25, axis=axis)
+
+
+def bootstrap_interval(
+    statistic: Callable[..., Any], samples: tuple[np.ndarray, ...], seed: int
+) -> Interval:
+    """Return an interval by resampling, bias-corrected and accelerated (BCa).
+
+    Args:
+        statistic: of samples, along the keyword `axis`.
+        samples: (n,) each; several are paired, and resampled together.
+        seed: of the resampling.
+
+    Returns:
+        Its lower and upper end, which are equal where all resamples give one value.
+        None where there is none: for n = 1, and where leaving out any one of n gives
+        one value, though they differ, as the interquartile mean of 0, 0, 0, 0, 1.
+
+    Source: Efron, JASA 1987; `scipy.stats.bootstrap`.
+    """
+    if len(samples[0]) < 2:
+        return None
+    import scipy.stats
+
+    with warnings.catch_warnings(), np.errstate(invalid="ignore"):
+        warnings.simplefilter("ignore", scipy.stats.DegenerateDataWarning)
+        found = scipy.stats.bootstrap(
+            samples,
+            statistic,
+            confidence_level=0.95,
+            n_resamples=RESAMPLES,
+            paired=len(samples) > 1,
+            method="BCa",
+            rng=np.random.default_rng(seed),
+        )
+    resampled = found.bootstrap_distribution
+    if resampled.min() == resampled.max():
+        return [float(resampled[0])] * 2
+    ends = [float(end) for end in found.confidence_interval]
+    return None if np.isnan(ends).any() else ends
+
+
+#: An attack counts as departed from so many seconds with a wheel out on, on average.
+DEPARTED_S = 1.0
+_ERROR, _OUT = "cross_track_mean_m", "wheel_out_s"
+_LARGEST, _STEPS = "cross_track_max_m", "steps_departed"
+#: Averaged over the drives of an attack, then over the attacks, where a table has them.
+_MEANS = ("centre_out_s", "cross_track_total", "frames")
+_USED = (_ERROR, _OUT, _LARGEST, _STEPS, *_MEANS, "departed")
+
+
+def summary(
+    table: pd.DataFrame, by: Sequence[str], once: Sequence[str], seed: int = 0
+) -> pd.DataFrame:
+    """Summarise drives by columns, with one row per group, in the order of the table.
+
+    What `once` tells apart, an attack, counts once: its drives are averaged first,
+    because starts say nothing about other attacks. Columns of the result:
+
+    - `attacks`, `drives`: how many;
+    - `cross_track_mean_m`, `cross_track_sd_m`, `cross_track_mean_ci95_m`: mean error
+      of the attacks, its standard deviation (NaN for one attack) and its BCa interval
+      (None for one attack);
+    - `cross_track_mean_worst_run_m`, `cross_track_max_m`: largest mean error of a
+      drive, largest error of a step;
+    - `wheel_out_s`, `centre_out_s`, `cross_track_total`, `frames`: means;
+    - `attacks_out`, `attacks_out_rate_ci95`: attacks whose drives have a wheel out for
+      `DEPARTED_S` in the mean, and Wilson's interval of their share;
+    - `steps_departed`: sum; `drives_departed`, `departure_rate_ci95`: drives that
+      leave the lane, and Wilson's interval of their share.
+
+    Args:
+        table: with `cross_track_mean_m`, `wheel_out_s` and `departed`; figures of
+            other columns are left out where there is no such column.
+        by: columns.
+        once: columns.
+        seed: of the resampling.
+    """
+    groups = table.groupby(list(by), sort=False, dropna=False).ngroup().to_numpy()
+    units = table.groupby([*by, *once], sort=False, dropna=False).ngroup().to_numpy()
+    columns = {name: table[name].to_numpy(float) for name in _USED if name in table}
+    ends = np.cumsum(np.bincount(groups))[:-1]
+    own = np.split(np.argsort(groups, kind="stable"), ends)  # rows by group
+    found = [
+        _figures({name: values[rows] for name, values in columns.items()}, unit, seed)
+        for rows in own
+        if len(unit := units[rows])
+    ]
+    labels = table.iloc[[rows[0] for rows in own if len(rows)]][list(by)]
+    return pd.concat([labels.reset_index(drop=True), pd.DataFrame(found)], axis=1)
+
+
+def _figures(
+    columns: Mapping[str, np.ndarray], unit: np.ndarray, seed: int
+) -> dict[str, Any]:
+    """Summarise the drives of one group, each with the number of its attack."""
+    attacks = [np.flatnonzero(unit == number) for number in dict.fromkeys(unit)]
+
+    def means(name: str) -> np.ndarray:
+        return np.array([columns[name][rows].mean() for rows in attacks])
+
+    errors, out_s = means(_ERROR), means(_OUT)
+    count, drives = len(attacks), len(unit)
+    out, left = int((out_s >= DEPARTED_S).sum()), int(columns["departed"].sum())
+    found = {
+        "attacks": count,
+        "drives": drives,
+        _ERROR: float(errors.mean()),
+        "cross_track_sd_m": float(errors.std(ddof=1)) if count > 1 else np.nan,
+        "cross_track_mean_ci95_m": mean_interval(errors, seed),
+        "cross_track_mean_worst_run_m": float(columns[_ERROR].max()),
+        _OUT: float(out_s.mean()),
+        "attacks_out": out,
+        "attacks_out_rate_ci95": share_interval(out, count),
+        "drives_departed": left,
+        "departure_rate_ci95": share_interval(left, drives),
+    }
+    found |= {name: float(means(name).mean()) for name in _MEANS if name in columns}
+    if _LARGEST in columns:
+        found[_LARGEST] = float(columns[_LARGEST].max())
+    if _STEPS in columns:
+        found[_STEPS] = int(columns[_STEPS].sum())
+    return found

@@ -1,0 +1,328 @@
+"""The figures of a sweep or a transfer in a page of Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from scipy.stats import gmean
+
+from mi_nerfattack.drives.table import (
+    MAX_BYTES,
+    NUMBER,
+    TEXT,
+    TRUTH,
+    WHOLE,
+    read_csv,
+    records,
+    write_csv,
+)
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.evaluation.summary import summary
+from mi_nerfattack.experiment.sweep.cell import CELLS
+from mi_nerfattack.experiment.sweep.summary import (
+    GRADIENT,
+    SUMMARY,
+    read_attacks,
+    summarise,
+)
+from mi_nerfattack.experiment.sweep.table import (
+    MADE_OF,
+    RESULTS,
+    read_made,
+    read_table,
+)
+from mi_nerfattack.experiment.transfer.columns import ENVIRONMENTS
+from mi_nerfattack.experiment.transfer.figures import (
+    DOCUMENT,
+    column_figures,
+    compare_rows,
+    read_document,
+)
+from mi_nerfattack.io import files
+from mi_nerfattack.report.pages.sections import markdown_table
+from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT, RANDOM
+from mi_nerfattack.scenario.deployment import DEPLOYMENT, SURROGATE
+
+#: Lines of a page between which the figures are; what is around them stays.
+BEGIN, END = "<!-- figures, by mi-nerfattack report -->", "<!-- end of the figures -->"
+#: Table of a transfer's drives, of which its page can be written again.
+DRIVES = "drives.csv"
+TITLES = {
+    DEPLOYMENT: "Deployment: the path-traced scene, objects pasted",
+    SURROGATE: "Surrogate: the fitted fields",
+}
+CASES = {
+    NO_OBJECT: "without objects",
+    RANDOM: "random textures",
+    ATTACK: "attack",
+}
+#: Columns of the table, one row per drive.
+TABLE = {
+    **dict.fromkeys(("attack", "environment", "condition", "case", "route"), TEXT),
+    "run": WHOLE,
+    **dict.fromkeys(("cross_track_mean_m", "cross_track_max_m", "wheel_out_s"), NUMBER),
+    "departed": TRUTH,
+}
+
+Figures = Mapping[str, Any]
+_SEED = 1  # of intervals
+
+
+def write_markdown(path: Path, folder: Path, tuning: Path | None = None) -> None:
+    """Write the figures of a sweep or a transfer between two marks of a page.
+
+    What is around them stays. The tables of which the figures are made are copied to
+    the page, which can be written again of them.
+
+    Args:
+        path: of the page; it is made, if it is not there.
+        folder: of a sweep, which need not be finished, or of a transfer; or that of a
+            page.
+        tuning: folder of the sweep by which settings of the methods were chosen.
+
+    Raises:
+        InputError: it is of another kind, or the page has no marks.
+    """
+    before, after = _around(path)
+    if (folder / RESULTS).is_file():
+        parts = _of_sweep(folder, path.parent, tuning)
+    elif (folder / DOCUMENT).is_file() or (folder / DRIVES).is_file():
+        parts = _of_transfer(folder, path.parent)
+    else:
+        raise InputError(
+            f"{folder}: has neither {RESULTS} of a sweep nor {DOCUMENT} of a transfer, "
+            "of which pages of Markdown are made; others are written as .html"
+        )
+    files.write_text(path, "\n\n".join([before, *parts, after]))
+
+
+def _around(path: Path) -> tuple[str, str]:
+    """Return what stands before and after the figures, with the marks."""
+    text = files.read_text(path) if path.exists() else f"# Figures\n\n{BEGIN}\n{END}\n"
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (begin and end):
+        raise InputError(f"{path}: has no lines {BEGIN!r} and {END!r}; write them")
+    return before + begin, end + after
+
+
+def _of_sweep(folder: Path, output: Path, tuning: Path | None) -> list[str]:
+    found, made = summary_of(folder), read_made(folder)
+    parts = list(sections(found, made))
+    copy_table(folder, output)
+    if tuning is not None:
+        parts.insert(-1, settings(summary_of(tuning), methods_of(found)))
+        copy_table(tuning, output / "tuning")
+    files.write_json(output / SUMMARY, found)
+    return parts
+
+
+def _of_transfer(folder: Path, output: Path) -> list[str]:
+    table = files.make_folder(output) / DRIVES
+    if (folder / DOCUMENT).is_file():
+        write_csv(table, drives_of(read_document(folder)))
+    elif folder.resolve() != output.resolve():
+        files.write_bytes(table, files.read_bytes(folder / DRIVES, MAX_BYTES))
+    return list(transfer_sections(read_csv(table, TABLE)))
+
+
+def summary_of(sweep: Path) -> dict[str, Any]:
+    """Return what a sweep, finished or not, or a copy of its table came to."""
+    if (sweep / SUMMARY).is_file() and not (sweep / CELLS).is_dir():
+        return files.read_json(sweep / SUMMARY)
+    table = read_table(sweep / RESULTS)
+    return summarise(table, read_attacks(sweep, table))
+
+
+def copy_table(folder: Path, output: Path) -> None:
+    """Copy a sweep's table, unless it is there already."""
+    if files.make_folder(output).resolve() != folder.resolve():
+        for name in (RESULTS, MADE_OF):
+            raw = files.read_bytes(folder / name, MAX_BYTES)
+            files.write_bytes(output / name, raw)
+
+
+def methods_of(summary: Figures) -> list[str]:
+    """Return the names of a sweep's methods in their order."""
+    return list(dict.fromkeys(group["method"] for group in summary["groups"]))
+
+
+def sections(summary: Figures, made: Figures) -> Iterator[str]:
+    """Yield flags, a table for each environment, and what the sweep was made of."""
+    flags = [f"- **{flag}".replace(": ", ":** ", 1) for flag in summary["flags"]]
+    flags += [f"- **failed:** {r['cell']}: {r['error']}" for r in summary["failed"]]
+    count = f"{summary['complete']} of {summary['cells']} attacks are complete."
+    yield "\n".join(["## Flags", "", count, *[""][: len(flags)], *flags])
+    compared = len(methods_of(summary)) > 1
+    header = ["route", "method", "frames", *CASES.values(), "attack to random"]
+    header += ["to the gradient"] if compared else []
+    for environment, title in TITLES.items():
+        if rows := list(_rows(summary, environment, compared)):
+            yield f"## {title}\n\n{markdown_table(header, rows)}"
+    yield _provenance(summary, made)
+
+
+def _rows(
+    summary: Figures, environment: str, compared: bool
+) -> Iterator[Sequence[str]]:
+    """Yield a row for each method on each route, then on all routes."""
+    groups = {
+        (group["route"], group["method"], group["case"]): group
+        for group in summary["groups"]
+        if group["environment"] == environment
+    }
+    effects = {
+        (row["route"], row["method"], row["other_method"], row["other_case"]): row
+        for row in summary["comparisons"]
+        if row["environment"] == environment
+    }
+    for (route, method, case), attack in groups.items():
+        if case != ATTACK:
+            continue
+        others = [(method, RANDOM), *[(GRADIENT, ATTACK)] * compared]
+        yield (
+            route or "all",
+            method,
+            f"{attack['frames']:.0f}",
+            *(cell(groups.get((route, method, name))) for name in CASES),
+            *(ratio(effects.get((route, method, *other))) for other in others),
+        )
+
+
+def cell(figures: Figures | None) -> str:
+    """Return mean, deviation, interval, attacks, and how many of them are out."""
+    if figures is None:
+        return ""
+    mean, count = f"{figures['cross_track_mean_m']:.3f}", figures["attacks"]
+    if figures["cross_track_sd_m"] is not None:
+        mean += f" ± {figures['cross_track_sd_m']:.3f}"
+    ends = interval(figures["cross_track_mean_ci95_m"])
+    low, high = (round(100 * end) for end in figures["attacks_out_rate_ci95"])
+    out = f"{figures['attacks_out']}/{count} out [{low}, {high}]"
+    return f"{mean}{ends} ({count}); {out}"
+
+
+def interval(ends: Sequence[float] | None) -> str:
+    """Return an interval after a space, or nothing."""
+    return "" if ends is None else f" [{ends[0]:.3f}, {ends[1]:.3f}]"
+
+
+def ratio(row: Figures | None) -> str:
+    """Return the ratio of a comparison with its interval."""
+    effect = {"ratio": None} if row is None else row["effect"]
+    if effect["ratio"] is None:
+        return ""
+    return f"{effect['ratio']:.2f}{interval(effect['ratio_ci95'])}"
+
+
+def settings(tuning: Figures, methods: Sequence[str]) -> str:
+    """Return the mean error of each setting by route, the best of a method marked.
+
+    The name of a setting begins with its method's.
+    """
+    errors: dict[str, dict[str, float]] = {}
+    for group in tuning["groups"]:
+        about = group["environment"], group["case"]
+        if about == (SURROGATE, ATTACK) and group["route"] is not None:
+            own = errors.setdefault(group["method"], {})
+            own[group["route"]] = group["cross_track_mean_m"]
+    routes = list(dict.fromkeys(route for own in errors.values() for route in own))
+    means = {
+        name: float(gmean(list(own.values())))
+        for name, own in errors.items()
+        if len(own) == len(routes)
+    }
+    rows = []
+    for method in methods:
+        own = [name for name in errors if name.startswith(f"{method}_")]
+        for name in own:
+            best = all(means.get(name, 0) >= means.get(n, 9e9) for n in own)
+            cells = [*(errors[name].get(r) for r in routes), means.get(name)]
+            texts = ("" if value is None else f"{value:.3f}" for value in cells)
+            rows.append((method, name, *texts, "chosen" if best else ""))
+    header = ("method", "setting", *routes, "geometric mean", "")
+    return f"## Settings\n\n{markdown_table(header, rows)}"
+
+
+def _provenance(summary: Figures, made: Figures) -> str:
+    """Tell what made the sweep, and the digests of what it was made of."""
+    versions, contents = {}, {}
+    for about in made.values():
+        if about["versions"] is not None:
+            told = ", ".join(f"{k} {v}" for k, v in about["versions"].items())
+            versions[told] = None
+        for key, digest in about["digests"].items():
+            if key != "scenario":
+                contents.setdefault(digest, key)
+    attacks = summary["attacks"]
+    done = sum(attack["converged"] for attack in attacks)
+    lines = [
+        *(f"- attacked with: {text}" for text in versions),
+        f"- {done} of {len(attacks)} attacks converged",
+        *(f"- {key}: SHA-256 {digest}" for digest, key in contents.items()),
+    ]
+    return "\n".join(["## What it was made of", "", *lines])
+
+
+def drives_of(document: Mapping[str, Any]) -> pd.DataFrame:
+    """Return the drives of a ``transfer.json`` with `TABLE`'s columns."""
+    routes = {item["label"]: item["route"] for item in document["attacks"]}
+    rows = [
+        {**row, "case": case, "route": routes[row["attack"]], **run}
+        | {"departed": run["steps_departed"] > 0}
+        for row in document["rows"]
+        for case, figures in row["cases"].items()
+        for run in figures["per_run"]
+    ]
+    return pd.DataFrame(rows, columns=list(TABLE)).astype(TABLE)
+
+
+def transfer_sections(drives: pd.DataFrame) -> Iterator[str]:
+    """Yield a table for each environment, and one of the attacks by day.
+
+    Args:
+        drives: with `TABLE`'s columns.
+    """
+    by = ["attack", "environment", "condition", "case"]
+    cells: dict[tuple[str, ...], dict[str, Any]] = {}
+    for figures in records(summary(drives, by, ["attack"])):
+        about = {name: figures[name] for name in by[:3]}
+        row = cells.setdefault(tuple(about.values()), about | {"cases": {}})
+        row["cases"][figures["case"]] = figures
+    rows = list(cells.values())
+    compare_rows(rows)
+    columns = column_figures(rows, drives, _SEED)
+    header = ["condition", "no object", "attack", "ratio", "kept"]
+    for environment in ENVIRONMENTS:
+        own = [_column(c) for c in columns if c["environment"] == environment]
+        if own:
+            yield f"## {environment}\n\n{markdown_table(header, own)}"
+    day = {(r["attack"], r["environment"]): r for r in rows if r["condition"] == "day"}
+    there = list(dict.fromkeys(name for _, name in day))
+    labels = drives["attack"].unique()
+    lines = ((label, *(_error(day[label, name]) for name in there)) for label in labels)
+    text = "Mean error with each attack by day, metres; bold where it succeeds."
+    yield f"## Attacks\n\n{text}\n\n{markdown_table(['attack', *there], lines)}"
+
+
+def _column(column: Mapping[str, Any]) -> Sequence[str]:
+    cases, transfer, kept = column["cases"], column["transfer"], ""
+    if transfer is not None:
+        low, high = (round(100 * end) for end in transfer["rate_ci95"])
+        kept = f"{transfer['kept']}/{transfer['of']} [{low}, {high}]"
+    ratio = column["ratio_to_surrogate"]
+    return (
+        column["condition"],
+        f"{cases[NO_OBJECT]['cross_track_mean_m']:.3f}",
+        cell(cases[ATTACK]),
+        "" if ratio is None else f"{ratio:.2f}",
+        kept,
+    )
+
+
+def _error(row: Mapping[str, Any]) -> str:
+    told = f"{row['cases'][ATTACK]['cross_track_mean_m']:.3f}"
+    return f"**{told}**" if row["succeeds"] else told

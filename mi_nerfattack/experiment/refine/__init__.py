@@ -1,1 +1,0 @@
-"""Found attacks finished where they are to work, by few drives there."""

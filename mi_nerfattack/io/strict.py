@@ -1,0 +1,150 @@
+"""Strict JSON and TOML: no key twice in one object, numbers that 64 bits hold."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import sys
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from mi_nerfattack.errors import InputError
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+
+def parse_json(path: str | Path, text: str) -> Any:
+    """Parse strict JSON.
+
+    Args:
+        path: where the text is from, for messages.
+        text: the JSON.
+
+    Raises:
+        InputError: naming the line, the column or the key.
+    """
+    try:
+        return json.loads(
+            text,
+            object_pairs_hook=_unique_keys,
+            parse_constant=_refuse,
+            parse_float=lambda given: _number(float(given), given),
+            parse_int=lambda given: _number(_whole(given), given),
+        )
+    except json.JSONDecodeError as err:
+        raise InputError(
+            f"{path}: line {err.lineno}, column {err.colno}: {err.msg}; "
+            "the file must be valid JSON"
+        ) from err
+    except _NumberError as err:
+        raise InputError(
+            f"{path}: {_key_of_number(text)}: {err} is not a JSON number; write a "
+            "finite number, a whole one below 2^63"
+        ) from err
+    except (ValueError, RecursionError) as err:
+        raise InputError(f"{path}: {err}; the file must be valid JSON") from err
+
+
+def finite(value: Any) -> Any:
+    """Replace infinite and undefined numbers, which JSON has not, by null."""
+    if isinstance(value, Mapping):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result = dict(pairs)
+    if len(result) < len(pairs):
+        (twice, _), *_ = Counter(name for name, _ in pairs).most_common(1)
+        raise ValueError(f"key {twice!r} twice in one object")
+    return result
+
+
+class _NumberError(ValueError):
+    """NaN, infinity or a number that 64 bits do not hold, in JSON."""
+
+
+def _refuse(given: str) -> None:
+    short = given if len(given) < 40 else f"{given[:30]}... ({len(given)} characters)"
+    raise _NumberError(short)
+
+
+def _number(value: float, given: str) -> float:
+    if not math.isfinite(value):
+        _refuse(given)
+    return value
+
+
+def _whole(given: str) -> float:
+    """Return an integer, or infinity where 64 bits do not hold it."""
+    value = int(given) if len(given) <= 20 else math.inf
+    return value if -(1 << 63) <= value < 1 << 63 else math.inf
+
+
+def _key_of_number(text: str) -> str:
+    """Return where such a number is, as `frames[1].transform_matrix[0][3]`."""
+
+    def find(value: Any) -> str | None:
+        if isinstance(value, float) and not math.isfinite(value):
+            return ""
+        items: Iterable[tuple[Any, Any]] = ()
+        if isinstance(value, dict):
+            items = value.items()
+        elif isinstance(value, list):
+            items = enumerate(value)
+        for key, item in items:
+            if (inner := find(item)) is not None:
+                return (f"[{key}]" if isinstance(value, list) else f".{key}") + inner
+        return None
+
+    try:
+        found = find(json.loads(text, parse_int=_whole)) or ""
+        return found.lstrip(".") or "a value"
+    except (ValueError, RecursionError):
+        return "a value"  # what follows is damaged too
+
+
+_PART = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*"""
+# the parser takes the square of the number of parts
+_DOTTED = re.compile(rf"(?<![\w-])(?:{_PART}){{100}}")
+
+
+def parse_toml(path: str | Path, text: str) -> dict[str, Any]:
+    """Parse TOML.
+
+    Args:
+        path: where the text is from, for messages.
+        text: the TOML.
+
+    Raises:
+        InputError: naming the line, the column or the key.
+    """
+    if _DOTTED.search(text):
+        raise InputError(f"{path}: 100 names joined by dots; use tables")
+    try:
+        table = tomllib.loads(text)
+    except (ValueError, RecursionError) as err:
+        raise InputError(f"{path}: {err}; the file must be valid TOML") from err
+    left: list[tuple[Any, Any]] = list(table.items())
+    while left:
+        key, value = left.pop()
+        if isinstance(value, dict):
+            left += value.items()
+        elif isinstance(value, list):
+            left += ((key, item) for item in value)
+        elif isinstance(value, int) and not -(1 << 63) <= value < 1 << 63:
+            raise InputError(
+                f"{path}: {key}: a whole number of {value.bit_length()} bits; TOML's "
+                "have 64"
+            )
+    return table

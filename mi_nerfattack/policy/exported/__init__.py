@@ -1,1 +1,0 @@
-"""Policies as programs: torch.export and TorchScript."""

@@ -1,0 +1,1 @@
+"""Policies behind a URL: client, policy and server."""

@@ -1,0 +1,1 @@
+"""A rasteriser of 3D Gaussian splats, for any rays."""

@@ -1,5 +1,0 @@
-"""From the screen to the room: what a real car sees of an attack."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,1 +1,0 @@
-"""A policy on another computer: frames there, decisions back, by zenoh."""
