@@ -23,9 +23,9 @@ class NerfAttackError(Exception):
             left_out = f" ... ({len(message) - _HEAD - _TAIL} characters) ... "
             message = message[:_HEAD] + left_out + message[-_TAIL:]
         super().__init__(message)
-        self.where = message.partition(": ")[0]
+        self.where: str = message.partition(": ")[0]
         _, found, last = message.rpartition("; ")
-        self.remedy = found and last
+        self.remedy: str = found and last
 
 
 class InputError(NerfAttackError, ValueError):

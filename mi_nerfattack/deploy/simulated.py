@@ -39,9 +39,12 @@ class AbstractSimulation(AbstractEnvironment):
     def __init__(
         self, name: str, vehicle: AbstractVehicle, camera: Camera, period: float
     ) -> None:
-        self.name, self.vehicle, self.camera = name, vehicle, camera
-        self.period, self.max_control = period, vehicle.max_control
-        self.control_unit = vehicle.control_unit
+        self.name: str = name
+        self.vehicle: AbstractVehicle = vehicle
+        self.camera: Camera = camera
+        self.period: float = period
+        self.max_control: float = vehicle.max_control
+        self.control_unit: str = vehicle.control_unit
         self._seed, self._steps = 0, -1
         self.blur_px, self.noise_sd = 0.0, 0.0  # of the camera
 

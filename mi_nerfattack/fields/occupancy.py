@@ -31,12 +31,14 @@ class Occupancy:
     """
 
     def __init__(self, cells: np.ndarray, octants: np.ndarray | None = None) -> None:
-        self.cells = np.ascontiguousarray(cells, dtype=bool)
+        self.cells: np.ndarray = np.ascontiguousarray(cells, dtype=bool)
         if self.cells.ndim != 3 or min(self.cells.shape) < 1:
             raise ValueError(f"occupancy: shape {cells.shape}; expected (rx, ry, rz)")
         rx, ry, rz = self.cells.shape
         self.shape: tuple[int, int, int] = (rx, ry, rz)
-        self.octants = None if octants is None else octants * self.cells
+        self.octants: np.ndarray | None = (
+            None if octants is None else octants * self.cells
+        )
         seen = self.cells if self.octants is None else self.octants > 0
         if seen.all():
             distance = np.zeros(self.shape, np.uint8)

@@ -54,7 +54,7 @@ class VertexColours:
         self._places = dr.minimum(place / level.scale, 1 - 1e-6)  # in the unit cube
         # Sums of the other levels' raw colours there, and of which texture
         self._others, self._summed = mi.Float(0), mi.Float(0)
-        self.value = mi.TensorXf()
+        self.value: mi.TensorXf = mi.TensorXf()
         self.read()
 
     def read(self) -> None:

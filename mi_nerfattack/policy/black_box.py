@@ -42,7 +42,8 @@ class AbstractBlackBox(AbstractPolicy):
     ) -> None:
         self.name = name
         self.preprocess: Preprocess = preprocess or Preprocess()
-        self.control_scale, self.output = float(control_scale), output
+        self.control_scale: float = float(control_scale)
+        self.output: int | None = output
 
     @abstractmethod
     def answer(self, image: np.ndarray, goals: np.ndarray, step: int) -> np.ndarray:

@@ -47,7 +47,7 @@ class PilotNet(nn.Module):
         self.goals = goals
         self.max_control: float = float(max_control)
         self.unit = unit
-        self.features = nn.Sequential(
+        self.features: nn.Sequential = nn.Sequential(
             nn.Conv2d(3, 24, 5, stride=2),
             nn.ELU(),
             nn.Conv2d(24, 36, 5, stride=2),
@@ -60,7 +60,7 @@ class PilotNet(nn.Module):
             nn.ELU(),
             nn.Flatten(),
         )
-        self.head = nn.Sequential(
+        self.head: nn.Sequential = nn.Sequential(
             nn.Linear(1152 + goals, 1000),
             nn.ELU(),
             nn.Linear(1000, 256),

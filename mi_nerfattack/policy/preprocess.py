@@ -135,7 +135,9 @@ class Resize(AbstractTransform):
     def __init__(self, width: int, height: int, filter: Filter = antialias) -> None:
         if min(width, height) < 1:
             raise InputError(f"resize_px: {[width, height]}; at least 1 each")
-        self.width, self.height, self.filter = width, height, filter
+        self.width: int = width
+        self.height: int = height
+        self.filter: Filter = filter
         self._weights: dict[tuple[int, int], torch.Tensor] = {}
 
     def apply(self, planes: torch.Tensor) -> torch.Tensor:
@@ -176,8 +178,8 @@ class ColourMatrix(AbstractTransform):
     def __init__(
         self, matrix: Sequence[Sequence[float]], offset: Sequence[float]
     ) -> None:
-        self.matrix = torch.tensor(matrix, dtype=torch.float64)
-        self.offset = torch.tensor(offset, dtype=torch.float64)[:, None, None]
+        self.matrix: torch.Tensor = torch.tensor(matrix, dtype=torch.float64)
+        self.offset: torch.Tensor = _column(offset)
 
     def apply(self, planes: torch.Tensor) -> torch.Tensor:
         """Mix; other numbers of channels than three are refused."""
@@ -226,8 +228,8 @@ class Normalise(AbstractTransform):
         if not scale or not all(value > 0 for value in std):
             raise InputError(f"scale {scale}, std {list(std)}; not 0, and positive")
         self.scale: float = float(scale)
-        self.mean = torch.tensor(mean, dtype=torch.float64)[:, None, None]
-        self.std = torch.tensor(std, dtype=torch.float64)[:, None, None]
+        self.mean: torch.Tensor = _column(mean)
+        self.std: torch.Tensor = _column(std)
 
     def apply(self, planes: torch.Tensor) -> torch.Tensor:
         """Scale and shift each channel."""
@@ -295,7 +297,9 @@ class Preprocess:
         if min(frames, stride) < 1:
             raise InputError(f"frames {frames}, stride {stride}; at least 1 each")
         self.transforms: tuple[AbstractTransform, ...] = tuple(transforms)
-        self.frames, self.stride, self.layout = frames, stride, layout
+        self.frames: int = frames
+        self.stride: int = stride
+        self.layout: Layout = layout
 
     @property
     def history(self) -> int:
@@ -366,6 +370,10 @@ class Preprocess:
             earlier = [known[:, max(0, last - age), None] for age in ages[:-1]]
             frames = torch.cat([*earlier, frames], dim=1)
         return frames, known
+
+
+def _column(values: Sequence[float]) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)[:, None, None]
 
 
 def _cut(planes: torch.Tensor, margins: Sequence[int]) -> torch.Tensor:

@@ -191,13 +191,14 @@ class TorchPolicy(AbstractPolicy):
         output: int | None = None,
         name: str | None = None,
     ) -> None:
-        self.module = module.eval()
+        self.module: torch.nn.Module = module.eval()
         for parameter in module.parameters():  # a ScriptModule has no requires_grad_
             parameter.requires_grad_(False)
         self.goal: AbstractGoal = goal or declared_goal(module)
         self.preprocess: Preprocess = preprocess or Preprocess()
         self.recurrent: tuple[tuple[int, ...], ...] = check_hidden(recurrent)
-        self.control_scale, self.output = float(control_scale), output
+        self.control_scale: float = float(control_scale)
+        self.output: int | None = output
         self.name: str = name or type(module).__name__
         self._checked = False
 

@@ -30,7 +30,9 @@ class SceneCamera:
     def __init__(
         self, sensor: Any, mount: CameraMount, seed: int, centred: bool = False
     ) -> None:
-        self.sensor, self.mount, self.seed = sensor, mount, seed
+        self.sensor: Any = sensor
+        self.mount: CameraMount = mount
+        self.seed: int = seed
         self.centred = centred
         if centred and math.isqrt(self.spp) ** 2 != self.spp:
             raise InputError(

@@ -75,7 +75,9 @@ class SceneSensor(AbstractDifferentiableSensor):
             )
         if isinstance(sensor, int):
             sensor = _sensor_of(scene, sensor)
-        self.camera = SceneCamera(sensor, mount or CameraMount(), seed, centred)
+        self.camera: SceneCamera = SceneCamera(
+            sensor, mount or CameraMount(), seed, centred
+        )
         #: A `field_integrator`, which marches rays of several frames together.
         self._collector: CollectsRays | None = None
         if isinstance(self.integrator, CollectsRays):
