@@ -17,7 +17,7 @@ help:
 	@echo "make test         run the tests, up to 23 minutes; less with compiled kernels"
 	@echo "make test-fast    run the quickest tests of every folder, at most 90 seconds"
 	@echo "make test-all     the slow ones too, at most 40 minutes"
-	@echo "make test-fuzz    100,000 damaged files of each format, hours; others each day"
+	@echo "make test-fuzz    100,000 damaged files of each format and seed, hours; goes on"
 	@echo "make test-random  formats and geometry on other examples each time"
 	@echo "make mutants      change the code 400 times and count what the tests notice, hours"
 	@echo "make lint         check format, lint and types"
@@ -41,11 +41,9 @@ test-slow: $(VENV)/.installed-test
 
 test-all: test test-slow
 
-# Count and seed of one's own: make test-fuzz FUZZ_COUNT=10 FUZZ_SEED=3
-test-fuzz: export FUZZ_COUNT ?= 100000
-test-fuzz: export FUZZ_SEED ?= $(shell date +%Y%m%d)
+# It goes on. Others: make test-fuzz FUZZ="scenario --seeds 3 --table build/fuzz.csv"
 test-fuzz: $(VENV)/.installed-test
-	$(PYTEST) tests/fuzz/test_fuzz.py -m slow
+	PYTHONPATH=tests $(VENV)/bin/python -m fuzz.campaign $(FUZZ)
 
 test-random: $(VENV)/.installed-test
 	$(PYTEST) -m hypothesis --hypothesis-profile random

@@ -52,12 +52,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="fuzz", description=__doc__.split("\n")[0])
     parser.add_argument("formats", nargs="*", default=list(FORMATS))
     parser.add_argument("--count", type=int, default=100)
+    parser.add_argument("--first", type=int, default=0, help="number of an input")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", type=int, help="one input, with its traceback")
     parser.add_argument("--keep", type=Path, help="folder for the inputs that fail")
     given = parser.parse_args()
     single = given.only is not None
-    numbers = [given.only] if single else range(given.count)
+    several = range(given.first, given.first + given.count)
+    numbers = [given.only] if single else several
     jobs = [(name, number) for name in given.formats for number in numbers]
     failures = fuzz(Plan(jobs, given.seed, single, given.keep))
     for (name, kind), found in failures.items():

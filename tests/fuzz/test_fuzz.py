@@ -1,7 +1,7 @@
 """Damaged files of every format are read, or refused by our error.
 
-`make test` tries 100 of each, and always the same; `make test-all` 1,000, and
-`make test-fuzz` 100,000.
+`make test` tries 100 of each, and always the same, `make test-all` 1,000. What
+`make test-fuzz` tried stands in `tried.csv`.
 """
 
 from __future__ import annotations
@@ -36,5 +36,4 @@ def test_damaged_files_are_read_or_refused():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FORMATS)
 def test_many_damaged_files_are_read_or_refused(name):
-    count = int(os.environ.get("FUZZ_COUNT", 10 * COUNT))
-    fuzz(name, "--count", count, "--seed", os.environ.get("FUZZ_SEED", 0))
+    fuzz(name, "--count", 10 * COUNT)
