@@ -18,7 +18,7 @@ from mi_nerfattack.io.resumable import array_digest
 from mi_nerfattack.ranges import Count, Finite, NonNegative
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.scenario.named_file import File
+from mi_nerfattack.scenario.named_file import FileOrFolder
 from mi_nerfattack.scenario.section import UNTAGGED, Kinds, Section
 
 #: What the environment of attacks is called, and the deployment without a name.
@@ -83,7 +83,7 @@ class ReplayDeployment(AbstractDeploymentSection):
     """A recorded drive, in which controls have no effect."""
 
     kind: Literal["replay"]
-    recording: File  # folder, video or MCAP log
+    recording: FileOrFolder  # folder, video or MCAP log
     topics: tuple[str, ...] = ()  # of a log: "image=/front", "vehicle_pose=/odom"
 
     def place(self, place: Place) -> Place:

@@ -96,8 +96,8 @@ class NamedFile:
         return {"file": shown, "sha256": digest.hexdigest()}
 
 
-def _file(value: Any, info: ValidationInfo) -> NamedFile:
-    """Find a file; the folder of relative paths is in the validation's context."""
+def _path(value: Any, info: ValidationInfo) -> NamedFile:
+    """Find a path; the folder of relative ones is in the validation's context."""
     if isinstance(value, NamedFile):
         return value
     if not isinstance(value, str):
@@ -106,6 +106,14 @@ def _file(value: Any, info: ValidationInfo) -> NamedFile:
         return NamedFile(value, resolve(value, (info.context or {}).get("folder", "")))
     except InputError as err:
         raise PydanticCustomError("file", "{why}", {"why": str(err)}) from err
+
+
+def _file(value: Any, info: ValidationInfo) -> NamedFile:
+    """Find what is no folder, which could hold a whole disk."""
+    named = _path(value, info)
+    if named.path is not None and os.path.isdir(named.path):
+        raise PydanticCustomError("file", "is a folder; a file is needed")
+    return named
 
 
 def _code(value: Any, info: ValidationInfo) -> NamedFile:
@@ -153,8 +161,10 @@ def _read(path: Path) -> bytes:
 
 _NAME = PlainSerializer(str, return_type=str)
 _TEXT = WithJsonSchema({"type": "string"})
-#: Types of keys: a file; ``FILE.py:NAME``; that or ``package.module:NAME``.
+#: Types of keys: a file; a file or a folder; ``FILE.py:NAME``; that or a name in an
+#: installed module, ``package.module:NAME``.
 File = Annotated[NamedFile, PlainValidator(_file), _NAME, _TEXT]
+FileOrFolder = Annotated[NamedFile, PlainValidator(_path), _NAME, _TEXT]
 Code = Annotated[NamedFile, PlainValidator(_code), _NAME, _TEXT]
 AnyCode = Annotated[NamedFile, PlainValidator(_any_code), _NAME, _TEXT]
 

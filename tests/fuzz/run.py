@@ -120,7 +120,8 @@ def _child(plan: Plan, at: int, shared: mmap.mmap, report: Path, work: str) -> N
     code = 1
     try:
         if not plan.verbose:  # what libraries print is no outcome
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+            for stream in (1, 2):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
         warnings.simplefilter("error")
         name, targets, good = "", [], {}
         for index in range(at, len(plan.jobs)):
