@@ -11,6 +11,7 @@ from bench.fit.bench import BenchFit
 from bench.gpu import BenchFrames, BenchGpu
 from bench.loop.bench import BenchLoop
 from bench.render.bench import BenchRender
+from bench.roughness import BenchRoughness
 from bench.splats import BenchSplats
 from mi_nerfattack import cli
 
@@ -21,6 +22,7 @@ COMMANDS = {
     "scaling": BenchScaling,
     "loop": BenchLoop,
     "splats": BenchSplats,
+    "roughness": BenchRoughness,
     "poses": BenchPoses,
     "gaps": BenchGaps,
     "frames": BenchFrames,

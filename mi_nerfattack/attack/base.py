@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -27,6 +27,8 @@ class IterationRecord:
         cross_track_mean_m: mean |e| over steps and poses, metres.
         cross_track_max_m: largest |e|, metres.
         costs: of each pose, before their reduction; of a search, none.
+        predicted_gain: by how much the objective falls in the update that follows, by
+            the gradient; None without one.
     """
 
     iteration: int
@@ -34,6 +36,7 @@ class IterationRecord:
     cross_track_mean_m: float
     cross_track_max_m: float
     costs: tuple[float, ...] = ()
+    predicted_gain: float | None = None
 
 
 class AbstractAttack(ABC):
@@ -126,6 +129,22 @@ class AbstractAttack(ABC):
             (n, 3): see :func:`best_so_far`.
         """
 
+    def rows(self) -> list[dict[str, Any]]:
+        """Return the history as ``attack.json`` has it, once finished."""
+        rows = map(asdict, self.history)
+        return [{k: v for k, v in row.items() if v is not None} for row in rows]
+
+    @property
+    def least_gain(self) -> dict[str, Any] | None:
+        """Where the gradient predicted a gain that hardly came, once finished.
+
+        Returns:
+            five iterations in a row, by the `first`, what they had `predicted` of the
+            objective, and what `came`: those with the least share. None without a
+            gradient, and where there are fewer.
+        """
+        return None
+
     @property
     def without_gradient(self) -> list[int]:
         """Objects that the objective did not depend on, in all iterations.
@@ -212,14 +231,17 @@ def history_tensors(history: Sequence[IterationRecord]) -> dict[str, np.ndarray]
 
     Returns:
         ``history`` (n, 4), the numbers of :class:`IterationRecord`; ``costs``, those of
-        all iterations end to end; ``cost_counts`` (n,), how many each has.
+        all iterations end to end; ``cost_counts`` (n,), how many each has;
+        ``predicted_gains``, of each or of none.
     """
-    rows = [astuple(record)[:-1] for record in history]
+    rows = [astuple(record)[:4] for record in history]
+    gains = [r.predicted_gain for r in history if r.predicted_gain is not None]
     costs = [cost for record in history for cost in record.costs]
     return {
         "history": np.array(rows, np.float64).reshape(-1, 4),
         "costs": np.array(costs, np.float64),
         "cost_counts": np.array([len(record.costs) for record in history], np.int64),
+        "predicted_gains": np.array(gains, np.float64),
     }
 
 
@@ -233,10 +255,14 @@ def read_history(tensors: dict[str, np.ndarray]) -> list[IterationRecord]:
     rows, counts, costs = (tensors[k] for k in ("history", "cost_counts", "costs"))
     if counts.shape != rows.shape[:1] or counts.sum() != len(costs):
         raise InputError(f"{len(rows)} iterations, costs of {len(counts)}")
-    parts = np.split(costs, np.cumsum(counts)[:-1])
+    gains = tensors["predicted_gains"].tolist()
+    if len(gains) not in (0, len(rows)):
+        raise InputError(f"{len(rows)} iterations, predicted gains of {len(gains)}")
+    parts = [part.tolist() for part in np.split(costs, np.cumsum(counts))[:-1]]
+    told = zip(rows.tolist(), parts, gains or [None] * len(rows), strict=True)
     return [
-        IterationRecord(int(iteration), *numbers, costs=tuple(part.tolist()))
-        for (iteration, *numbers), part in zip(rows.tolist(), parts, strict=False)
+        IterationRecord(int(at), *numbers, costs=tuple(part), predicted_gain=gain)
+        for (at, *numbers), part, gain in told
     ]
 
 

@@ -127,6 +127,15 @@ class Schedule:
         turn = self._turn(objectives)
         return turn is not None and has_settled(objectives[:turn])
 
+    def full(self, objectives: Sequence[float]) -> int:
+        """Return how many iterations had the full rates.
+
+        Args:
+            objectives: of the iterations that are done.
+        """
+        turn = self._turn(objectives)
+        return len(objectives) if turn is None else turn
+
     def _turn(self, objectives: Sequence[float]) -> int | None:
         """Return after how many iterations the rates began to fall."""
         last = math.ceil(0.75 * self.max_iterations)

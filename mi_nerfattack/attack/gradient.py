@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -30,6 +31,7 @@ from mi_nerfattack.rollout.sweep import Gradient, differentiable
 from mi_nerfattack.vehicle.route.route import Route
 
 OFFSETS = "offsets"
+_ROW = 5  # iterations, of which the predicted gain is compared with what came
 
 #: Parameters of the objects' textures, (n, 3) each, by the optimiser's key.
 Parameters = dict[str, np.ndarray]
@@ -119,8 +121,8 @@ class GradientAttack(AbstractAttack):
             gradient = self.rollout.gradient(evaluation, moved, on_step=on_step)
         values = self._values(gradient)
         self.whole = False
-        self._update(values)
-        self.history.append(record)
+        gain = self._update(values)
+        self.history.append(replace(record, predicted_gain=gain))
         self.whole = True
         return record
 
@@ -163,6 +165,40 @@ class GradientAttack(AbstractAttack):
             return [texture.numpy().copy() for texture in self.sensor.textures()]
         return self._textures(self._best)
 
+    def rows(self) -> list[dict[str, Any]]:
+        """See ``AbstractAttack.rows``; `gain` is what came of the predicted one."""
+        return [
+            row | {"gain": float(gain)}
+            for row, gain in zip(super().rows(), self._gains, strict=True)
+        ]
+
+    @property
+    def least_gain(self) -> dict[str, Any] | None:
+        """See ``AbstractAttack.least_gain``, of iterations at the full rates.
+
+        Of an attack that converged, their last fifth, which was to gain nothing, does
+        not count.
+        """
+        count = self.schedule.full(self._objectives)
+        if self.has_converged:
+            count -= count // 5
+        predicted = [record.predicted_gain or 0.0 for record in self.history[:count]]
+        if count < _ROW:
+            return None
+        said, came = (
+            np.convolve(gains, np.ones(_ROW), "valid")
+            for gains in (predicted, self._gains[:count])
+        )
+        first = int(np.argmin(came / np.maximum(said, 1e-300)))
+        row = {"predicted": float(said[first]), "came": float(came[first])}
+        return {"first": first, **row}
+
+    @property
+    def _gains(self) -> np.ndarray:
+        """By how much the objective fell after each iteration, (n,), once finished."""
+        last = [self._last.objective] if self._last else self._objectives[-1:]
+        return -np.diff([*self._objectives, *last])
+
     @property
     def without_gradient(self) -> list[int]:
         """See ``AbstractAttack.without_gradient``."""
@@ -196,21 +232,19 @@ class GradientAttack(AbstractAttack):
                 stack.enter_context(field.one_level(level))
             yield
 
-    def _values(self, gradient: Gradient) -> dict[str, Any]:
+    def _values(self, gradient: Gradient) -> Parameters:
         """Return the gradient by the optimiser's keys, checked."""
         colours = self._colours()
         values = {
-            key: _tensor(
-                colouring.gradient(colours[key], gradient.textures[int(key)].numpy())
-            )
+            key: colouring.gradient(colours[key], gradient.textures[int(key)].numpy())
             for key, colouring in self._colourings.items()
         }
         if self.freedom.pose_rate is not None:
             by_offsets = offset_gradients(self.sensor, gradient)
-            values[OFFSETS] = _tensor(by_offsets * self.freedom.mask)
+            values[OFFSETS] = by_offsets * self.freedom.mask
         values = {key: values[key] for key in self.optimiser}
         for key, value in values.items():
-            if not np.isfinite(value.numpy()).all():
+            if not np.isfinite(value).all():
                 what = "the poses" if key == OFFSETS else f"object {key}"
                 raise InputError(
                     f"attack iteration {self.iteration}: the gradient of {what} is not "
@@ -218,19 +252,31 @@ class GradientAttack(AbstractAttack):
                 )
         return values
 
-    def _update(self, values: dict[str, Any]) -> None:
+    def _update(self, gradients: Parameters) -> float:
+        """Step; return the gain that the gradients predict."""
+        before = {key: self._value(key) for key in gradients}
+        values = {
+            key: self._colourings[key].smoothed(value) if key != OFFSETS else value
+            for key, value in gradients.items()
+        }
         share = self.schedule.rate(self._objectives)
         full = {key: self.freedom.texture_rate or 0.0 for key in values}
         full[OFFSETS] = self.freedom.pose_rate or 0.0
         self.optimiser.set_learning_rate({key: share * full[key] for key in values})
         for key, value in values.items():
-            dr.set_grad(self.optimiser[key], value)
+            dr.set_grad(self.optimiser[key], _tensor(value))
         self.optimiser.step()
         for key, colours in self._colours().items():
             self.optimiser[key] = _tensor(self._colourings[key].project(colours))
         if OFFSETS in values:
             moved = np.array(dr.detach(self.optimiser[OFFSETS]), np.float64)
             self.optimiser[OFFSETS] = _tensor(self.freedom.project(moved))
+        steps = {key: self._value(key) - old for key, old in before.items()}
+        return -sum(float((gradients[key] * step).sum()) for key, step in steps.items())
+
+    def _value(self, key: str) -> np.ndarray:
+        """Return what the optimiser has, copied."""
+        return dr.detach(self.optimiser[key]).numpy().copy()
 
     def _install(self) -> None:
         """Give the sensor the optimiser's parameters."""
@@ -243,8 +289,7 @@ class GradientAttack(AbstractAttack):
 
     def _colours(self) -> Parameters:
         """Return what is stepped in, by the optimiser's key."""
-        values = {k: dr.detach(self.optimiser[k]) for k in self._colourings}
-        return {key: value.numpy().copy() for key, value in values.items()}
+        return {key: self._value(key) for key in self._colourings}
 
     def _penalty(self, colours: Parameters) -> float:
         return sum(c.penalty(colours[key]) for key, c in self._colourings.items())

@@ -279,6 +279,12 @@ class _Optimised(_Model):
     field_cross_track_mean_m: NonNegative
 
 
+class _Gain(_Model):
+    first: Whole
+    predicted: float
+    came: float
+
+
 class _Bricks(_Optimised):
     file: str
 
@@ -307,6 +313,7 @@ class _Document(_Model):
     verdict: list[str] | None = None
     baseline: _Baseline | None = None
     curve: _Curve | None = None
+    least_gain: _Gain | None = None
     bricks: _Bricks | None = None
     one_level: _Optimised | None = None
     object_poses: dict[str, Any] | None = None

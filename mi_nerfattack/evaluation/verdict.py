@@ -130,6 +130,9 @@ SATURATED = 0.5
 #: An object is hardly in view below this share of the pixels, on average over a drive.
 HARDLY = 0.001
 
+#: A gradient misleads where less than this share of the gain that it predicts comes.
+COMES = 0.01
+
 #: `frames` rendered, increasing, and the least `objective` until then, a number each.
 Curve = Mapping[str, Sequence[float]]
 
@@ -151,6 +154,8 @@ def run_flags(
             "; bring it into view, or see whether the policy has derivatives where it "
             "is used"
         )
+    if (gain := document.get("least_gain")) is not None:
+        yield from _misleading(gain)
     curve = document.get("curve")
     if by_gradient and curve is not None:
         looks = _random_curve(curve["frames"][0], document["baseline"]["objectives"])
@@ -163,6 +168,16 @@ def run_flags(
         yield from _not_converged(curve)
     for name, texture in document["textures"].items():
         yield from _texture(name, texture)
+
+
+def _misleading(gain: Figures) -> Iterator[str]:
+    if gain["came"] < COMES * gain["predicted"]:
+        yield (
+            f"gradient misleads: for the five iterations from {gain['first']} on, it "
+            f"predicted that the objective falls by {gain['predicted']:.3g}; it fell "
+            f"by {gain['came']:.3g}; the gradient holds camera poses that the drive "
+            "does not; try a lower learning rate, or other starts"
+        )
 
 
 def black_box_better(gradient: Curve, others: Mapping[str, Curve]) -> Iterator[str]:

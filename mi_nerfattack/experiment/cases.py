@@ -43,7 +43,7 @@ SEARCH_KEYS = (
     "drive.runs",
 )
 #: Parts that only drives in the surrogate depend on.
-_SURROGATE_KEYS = ("field", "composite", "step_m", "stop", "to_world")
+_SURROGATE_KEYS = ("field", "composite", "spp", "step_m", "stop", "to_world")
 
 
 def decisive(

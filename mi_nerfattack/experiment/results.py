@@ -93,7 +93,7 @@ def write_results(
     Returns:
         the document that ``metrics.json`` holds.
     """
-    history = [asdict(record) for record in done.attack.history]
+    history = done.attack.rows()
     path = output / METRICS
     _write_tables(output, done, history)
     document = _describe(done, effort)
@@ -145,6 +145,8 @@ def _describe(done: Finished, effort: Callable[[], Effort]) -> dict[str, Any]:
     if (curve := done.curve) is not None:
         more["curve"] = curve
     more["converged"] = done.attack.has_converged
+    if (gain := done.attack.least_gain) is not None and not done.ignored:
+        more["least_gain"] = gain
     bricks, one_level = scenario.scene.bricks, done.attack.one_level
     if bricks is not None or one_level:
         means = _optimised_and_exact(done)

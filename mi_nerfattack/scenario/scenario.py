@@ -71,6 +71,7 @@ class SceneSection(Section):
     routes: File  # JSON of routes
     route: str  # name of the route that is driven
     composite: Literal["depth", "interleaved"] = "depth"  # of fields, in the surrogate
+    spp: Literal[1, 4, 9, 16] = 1  # rays per pixel in the surrogate
     step_m: Positive | None = None  # of the march near the camera; the field's own
     stop: Fraction = STOP  # transmittance at which rays end in the surrogate
     to_world: tuple[Row, Row, Row, Row] | None = None  # of the field: uniform scale
@@ -97,7 +98,15 @@ class SceneSection(Section):
             if self.field is None:
                 refuse("field", "is missing; give it, or surrogate")
             return self
-        for key in ("field", "bricks", "composite", "step_m", "stop", "to_world"):
+        for key in (
+            "field",
+            "bricks",
+            "composite",
+            "spp",
+            "step_m",
+            "stop",
+            "to_world",
+        ):
             if getattr(self, key) != self.defaults()[key]:
                 refuse(key, f"{self.surrogate} says it; leave out this, or surrogate")
         return self

@@ -288,7 +288,7 @@ def build_surrogate(scenario: Scenario) -> SceneSensor:
     look = jitter, place.stop, place.composite, names
     assert place.field is not None  # checked by SceneSection
     scene = _load_layer(scenario, place.field.file)
-    return field_sensor(scene, posed, camera, mount, *look)
+    return field_sensor(scene, posed, camera, mount, *look, spp=place.spp)
 
 
 def build_rollout(world: World) -> tuple[Rollout, Any]:

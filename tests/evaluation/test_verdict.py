@@ -119,6 +119,13 @@ def test_a_good_run_raises_none(document):
     check(document, "gradient zero", "ball, car", without=["ball", "car"])
 
 
+def test_a_gradient_of_which_hardly_anything_comes_is_told(document):
+    document["least_gain"] = {"first": 7, "predicted": 40.0, "came": 0.4}
+    check(document, "")
+    document["least_gain"]["came"] = 0.399
+    check(document, "gradient misleads", "from 7 on", "falls by 40", "by 0.399")
+
+
 def test_random_looks_that_find_more_are_an_alarm_on_gradients_alone(document):
     """After 40 frames, of which a look takes 10, the gradient is at -3."""
     document["baseline"]["objectives"][1] = -9.0

@@ -18,6 +18,7 @@ import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import chain
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
@@ -96,7 +97,10 @@ class Measured:
         path = str(ROOT / PACKAGE / change.path)
         if path not in self._contexts:
             self._contexts[path] = self._data.contexts_by_lineno(path)
-        contexts = self._contexts[path].get(change.line, [])
+        lines = self._contexts[path]
+        # what an import executes, as constants are, all tests of the module may notice
+        import_only = "" in lines.get(change.line, [])
+        contexts = chain(*lines.values()) if import_only else lines.get(change.line, [])
         names = {context.split("|")[0] for context in contexts if context}
         # what mirrors the folder comes first: these tests are meant for it
         folder = f"tests/{change.path.rsplit('/', 1)[0]}/"
@@ -129,7 +133,7 @@ def _copied(tree: Path) -> Path:
     )
     for name in listed.stdout.split("\0")[:-1]:
         (tree / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(ROOT / name, tree / name)
+        shutil.copy(ROOT / name, tree / name, follow_symlinks=False)
     for name in ("plugins", "scenes"):
         (tree / PACKAGE / name).symlink_to(tree / name)
     return tree

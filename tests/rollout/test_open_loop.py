@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from mi_nerfattack.attack.base import distances
 from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.attack.objectives import CrossTrackDeviation
+from mi_nerfattack.attack.texture.colours import Colours
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.objective import StageSum
@@ -105,6 +107,31 @@ def test_an_attack_by_it_makes_the_closed_loop_worse(closed):
     assert evaluation.value < before - 0.01 * abs(before)
     through = attack.measure_through(rollout.loop.sensor)  # in the closed loop
     assert through == distances(toy.ROUTE, evaluation).mean()
+
+
+@pytest.mark.parametrize("smoothing", [0, 2])
+def test_small_steps_gain_what_the_gradient_predicts(closed, smoothing):
+    """Of images whose camera stays, which is what a detached gradient is of."""
+    rollout, initial, _ = closed
+    colouring = partial(Colours, smoothing=smoothing)
+    freedom = Freedom(0.003, colouring=colouring)
+    opened = rollout.open_loop(initial)
+    attack = GradientAttack(opened, toy.ROUTE, initial, freedom)
+    assert attack.rows() == [] and attack.least_gain is None
+    for _ in range(5):
+        attack.step()
+    again = GradientAttack(opened, toy.ROUTE, initial, freedom)
+    again.load_tensors(attack.tensors())
+    assert again.history == attack.history
+    attack.finish()
+    for row in attack.rows():
+        assert row["gain"] == pytest.approx(row["predicted_gain"], rel=0.05)
+        assert row["gain"] > 0
+    least, rows = attack.least_gain, attack.rows()
+    assert least["predicted"] == pytest.approx(sum(r["predicted_gain"] for r in rows))
+    assert least["came"] == pytest.approx(
+        rows[0]["objective"] - attack.judged_objective, rel=1e-6
+    )
 
 
 def test_what_makes_no_sense_is_refused(closed):

@@ -43,12 +43,16 @@ class AbstractColouring(ABC):
 
     @abstractmethod
     def gradient(self, value: np.ndarray, by_texture: np.ndarray) -> np.ndarray:
-        """Return the direction (n, 3) in which parameters step down.
+        """Return the derivative (n, 3) by the parameters, that of the penalty added.
 
         Args:
             value: (n, 3), the parameters.
             by_texture: (n_vertices, 3), derivative by the texture.
         """
+
+    def smoothed(self, gradient: np.ndarray) -> np.ndarray:
+        """Return the direction (n, 3) that parameters step against."""
+        return gradient
 
     def project(self, value: np.ndarray) -> np.ndarray:
         """Return parameters (n, 3) that are allowed, near to given ones."""
@@ -118,13 +122,15 @@ class Colours(AbstractColouring):
         """See :meth:`AbstractColouring.gradient`."""
         # d logit(c) = dc / (c (1 - c))
         slope = by_texture[self.level.vertices] / (value * (1 - value))
-        slope = slope + self._allowed.penalty(value)[1]
-        # Binomial filter along z, y and x
-        cube = slope.reshape((self.level.resolution,) * 3 + (3,))
+        return slope + self._allowed.penalty(value)[1]
+
+    def smoothed(self, gradient: np.ndarray) -> np.ndarray:
+        """Filter along z, y and x, see :meth:`AbstractColouring.smoothed`."""
+        cube = gradient.reshape((self.level.resolution,) * 3 + (3,))
         for _ in range(self.smoothing):
             for axis in range(3):
                 cube = convolve1d(cube, _BINOMIAL, axis, mode="constant")
-        return cube.reshape(slope.shape)
+        return cube.reshape(gradient.shape)
 
     def project(self, value: np.ndarray) -> np.ndarray:
         """See :meth:`AbstractColouring.project`."""

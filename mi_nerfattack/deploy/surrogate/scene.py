@@ -33,11 +33,13 @@ def field_sensor(
     stop: float = STOP,
     composite: str = "depth",
     names: Sequence[str] = (),
+    spp: int = 1,
 ) -> SceneSensor:
     """Write the scene of fields and a camera, and see it through a `field_integrator`.
 
-    Rays go through the centres of pixels. The sensor's parameters are the colours of
-    the objects. Scene and sensor share the fields with whoever gave them.
+    Rays go through the middles of equal squares of a pixel. The sensor's parameters
+    are the colours of the objects. Scene and sensor share the fields with whoever gave
+    them.
 
     Args:
         scene: fields, splats or bricks; behind all is the sky of the first that has
@@ -50,9 +52,11 @@ def field_sensor(
         stop: transmittance at which rays end.
         composite: ``depth`` or ``interleaved``.
         names: ids of the objects' volumes; ``object``, ``object1``, ... by default.
+        spp: rays per pixel, a square number; their mean is taken in linear RGB.
 
     Raises:
-        InputError: no such composite, or layers that it cannot take.
+        InputError: no such composite, layers that it cannot take, or `spp` is no
+            square number.
         TypeError: an object that is no grid field.
         ValueError: two objects that share a field.
     """
@@ -68,7 +72,7 @@ def field_sensor(
     called = iter(names) if names else _names("object", set())
     shown = [_volume(item, next(called)) for item in objects]
     options = {"composite": composite, "stop": stop, "jitter": jitter_seed is not None}
-    lens = mitsuba_sensor_dict(camera, np.eye(4), 1) | {"near_clip": _NEAR_M}
+    lens = mitsuba_sensor_dict(camera, np.eye(4), spp) | {"near_clip": _NEAR_M}
     return _see(
         Shown(others, shown, options=options),
         [mi.load_dict(lens)],

@@ -315,7 +315,9 @@ class Film:
             describe_lens(self.environment.camera),
             moment.seen.camera_to_world,
             drive.seed,
-            1 if label == SURROGATE else world.deployments[label].spp,
+            world.surrogate.camera.spp
+            if label == SURROGATE
+            else world.deployments[label].spp,
             self.digests,
             scenario=world.scenario.name,
             environment=label,

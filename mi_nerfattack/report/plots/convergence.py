@@ -21,12 +21,13 @@ def convergence(
     history: Sequence[Mapping[str, float]],
     curve: Mapping[str, Sequence[float]] | None = None,
 ) -> None:
-    """Plot an attack's objective and mean cross-track error against its cost.
+    """Plot an attack's objective, mean error and gains against its cost.
 
     Args:
         path: PNG file.
         history: one mapping per iteration with the keys `objective` and
-            `cross_track_mean_m`; iterations count from 0.
+            `cross_track_mean_m`; iterations count from 0. Of a gradient, `gain` and
+            `predicted_gain`, too.
         curve: `frames` and the same keys, of the best so far; of the first iterations,
             one after the other, and what came after them. None: drawn by iterations.
     """
@@ -34,10 +35,12 @@ def convergence(
     count = len(history)
     at = np.arange(count) if curve is None else np.array(curve["frames"][:count])
     marker = "o" if count < 60 else ""
-    with chart(path, 4.2) as figure:
-        for axis, (name, label) in zip(
-            figure.subplots(2, 1, sharex=True), names.items(), strict=True
-        ):
+    has_gains = any("gain" in entry for entry in history)
+    with chart(path, 5.6 if has_gains else 4.2) as figure:
+        axes = figure.subplots(2 + has_gains, 1, sharex=True)
+        if has_gains:
+            _draw_gains(axes[2], at, history)
+        for axis, (name, label) in zip(axes[:2], names.items(), strict=True):
             values = [float(entry[name]) for entry in history]
             style = {"color": ORANGE, "marker": marker, "markersize": 3}
             axis.plot(at, values, label="of an iteration", **style)
@@ -52,6 +55,21 @@ def convergence(
         words = "iteration" if curve is None else "frames rendered, or their cost"
         figure.axes[-1].set_xlabel(words)
         figure.align_ylabels()
+
+
+def _draw_gains(
+    axis: Axes, at: np.ndarray, history: Sequence[Mapping[str, float]]
+) -> None:
+    """Draw what the gradient predicted of each iteration, and what came."""
+    for key, label, look in (
+        ("predicted_gain", "predicted by the gradient", {"color": PALETTE[2]}),
+        ("gain", "came", {"color": ORANGE, "marker": ".", "linewidth": 0.8}),
+    ):
+        axis.plot(at, [entry[key] for entry in history], label=label, **look)
+    axis.set_yscale("symlog", linthresh=0.1)
+    axis.set_ylabel("gain")
+    axis.grid(alpha=0.25)
+    axis.legend(frameon=False, fontsize=8)
 
 
 def damage(path: str | Path, methods: Mapping[str, Curves]) -> None:
