@@ -273,3 +273,41 @@ def test_grey_variants_are_refused(no_variant_left):
     mi.set_variant("llvm_ad_mono")
     with pytest.raises(SetupError, match="llvm_ad_rgb"):
         field_sensor([], [], CAMERA)
+
+
+@pytest.mark.parametrize("side", [2, 3])
+def test_rays_of_a_pixel_are_those_of_a_larger_image(side):
+    """Their mean in linear light; the texture's gradient spreads over them."""
+    shown, scene = objects(), fog()
+    large = from_fov(side * toy.WIDTH, side * toy.HEIGHT, 70.0)
+    few = field_sensor(scene, shown, CAMERA, toy.MOUNT, spp=side**2)
+    many = field_sensor(scene, shown, large, toy.MOUNT)
+    state = to_state(STATE)
+    found, wanted = (sensor.observe(state, 0) for sensor in (few, many))
+    rows = wanted.linear.numpy().T.reshape(toy.HEIGHT, side, toy.WIDTH, side, 3)
+    mean = rows.mean((1, 3)).reshape(-1, 3)
+    np.testing.assert_allclose(found.linear.numpy().T, mean, atol=2e-6)
+
+    def gradient(sensor, observation, d_linear):
+        """Differentiate a sum of linear pixels by the texture."""
+        linear = observation.linear.numpy().T
+        slope = np.where(
+            linear > 0.0031308, 1.055 / 2.4 * linear ** (1 / 2.4 - 1), 12.92
+        )
+        d_image = d_linear / slope.reshape(d_linear.shape)
+        sensor.start_gradient()
+        sensor.vjp(observation, state, mi.TensorXf(d_image[None].astype("f4")), False)
+        found = sensor.texture_gradients()[0].numpy()
+        sensor.stop_gradient()
+        return found
+
+    weights = np.random.default_rng(3).normal(size=(toy.HEIGHT, toy.WIDTH, 3))
+    spread = weights.repeat(side, 0).repeat(side, 1) / side**2
+    ours, theirs = gradient(few, found, weights), gradient(many, wanted, spread)
+    assert np.abs(theirs).max() > 1e-3
+    np.testing.assert_allclose(ours, theirs, atol=1e-5 * np.abs(theirs).max())
+
+
+def test_rays_that_fill_no_square_are_refused():
+    with pytest.raises(InputError, match="samples per pixel: .*1, 4, 9"):
+        field_sensor(fog(), [], CAMERA, toy.MOUNT, spp=5)

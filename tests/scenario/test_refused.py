@@ -111,6 +111,8 @@ route = "lane" -> => :2: scene.route: is missing
 field = "scene.safetensors" -> => :2: scene.field: is missing; give it, or surrogate
 field = "scene.safetensors" -> field = "a"; surrogate = "a.xml" => :3: scene.field: .*
 field = "object.safetensors" -> => objects.0.field: is missing
+field = "scene.safetensors" -> field = "a"; spp = 2 => :4: scene.spp: .* 1, 4, 9 or 16
+field = "scene.safetensors" -> surrogate = "a.xml"; spp = 4 => :4: scene.spp: a.xml says
 field = "scene.safetensors" -> surrogate = "a.xml" => :9: objects.0.field: a.xml says it
 """
 
