@@ -45,6 +45,8 @@ class BenchRoughness:
     """Table (.csv): a row for each place and number of rays."""
     changes: Count = 10
     """Random changes of each."""
+    json: bool = False
+    """Print one line of JSON in place of the table."""
 
     def run(self) -> Result:
         """Measure what has no row yet, and print the table."""
