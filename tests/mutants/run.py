@@ -1,10 +1,10 @@
 """Change the code and run its tests: ``python -m mutants.run`` with `tests` as a path.
 
-One run of the folders of tests that mirror the parts, and of `OTHERS`, says by coverage
-which tests execute which line, and how long each takes. Every change is then made in a
-copy of the tree, and tests of its line run there, the quickest first, until one fails
-or `SECONDS` are over. The table gets a row as a change is judged; what has a row is not
-done again.
+One run of all tests says by coverage which of them execute which line, and how long
+each takes. Every change is then made in a copy of the tree, and tests of its line run
+there, the quickest first, until one fails or `SECONDS` are over. The table gets a row
+as a change is judged. What has a row is not done again; with ``--again``, what no test
+noticed is.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
 from pathlib import Path
@@ -31,8 +30,6 @@ ROOT = Path(__file__).parents[2]
 WORK = ROOT / "build" / "mutants"
 PACKAGE = "mi_nerfattack"
 PARTS = "rollout render evaluation drives attack car/drive/safety car/vesc".split()
-#: Folders of tests that say much of parts that they do not mirror.
-OTHERS = ("plugins",)
 #: Of tests of one change, as they were measured, and of one run beside others.
 SECONDS, LIMIT_S = 60.0, 600.0
 
@@ -44,11 +41,14 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     parser.add_argument("--parts", nargs="*", default=PARTS)
+    parser.add_argument("--again", action="store_true")
     parser.add_argument("--table", type=Path, default=WORK / "changes.csv")
     given = parser.parse_args()
-    measured = Measured(given.parts)
+    measured = Measured()
     drawn = draw(ROOT / PACKAGE, given.parts, given.count, given.seed)
     rows = _read(given.table)
+    if given.again:
+        rows = [row for row in rows if row["outcome"] == "noticed"]
     done = {(row["path"], row["line"], row["after"]) for row in rows}
     waiting = [c for c in drawn if (c.path, str(c.line), c.after) not in done]
     trees: SimpleQueue[Path] = SimpleQueue()
@@ -69,8 +69,7 @@ def main() -> int:
 class Measured:
     """Which tests execute which line of the package, and how long each takes."""
 
-    def __init__(self, parts: Sequence[str]) -> None:
-        folders = {part.partition("/")[0] for part in parts}.union(OTHERS)
+    def __init__(self) -> None:
         data, times = WORK / "coverage", WORK / "times.xml"
         if not times.exists():
             WORK.mkdir(parents=True, exist_ok=True)
@@ -78,7 +77,6 @@ class Measured:
                 *("-n", str(os.cpu_count()), "-m", "not slow", "--dist", "worksteal"),
                 *(f"--cov={PACKAGE}", "--cov-context=test", "--cov-report="),
                 f"--junitxml={times}",
-                *(f"tests/{folder}" for folder in sorted(folders)),
             ]
             environment = os.environ | {"COVERAGE_FILE": str(data)}
             subprocess.run(
