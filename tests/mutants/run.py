@@ -3,8 +3,9 @@
 One run of all tests says by coverage which of them execute which line, and how long
 each takes. Every change is then made in a copy of the tree, and tests of its line run
 there, the quickest first, until one fails or `SECONDS` are over. The table gets a row
-as a change is judged. What has a row is not done again; with ``--again``, what no test
-noticed is.
+as a change is judged. What has a row is not done again. With ``--again``, what no test
+noticed is, by tests of all lines of its module: coverage counts what is cached for one
+test alone.
 """
 
 from __future__ import annotations
@@ -55,7 +56,8 @@ def main() -> int:
     for number in range(given.workers):
         trees.put(_copied(WORK / f"tree_{number}"))
     with ThreadPoolExecutor(given.workers) as pool:
-        judged = pool.map(lambda change: _judge(change, measured, trees), waiting)
+        wide = given.again
+        judged = pool.map(lambda c: _judge(c, measured.tests(c, wide), trees), waiting)
         for change, (outcome, test) in zip(waiting, judged, strict=True):
             row = {"seed": str(given.seed), "outcome": outcome, "test": test}
             columns = ("path", "line", "kind", "before", "after")
@@ -90,15 +92,20 @@ class Measured:
             for case in ElementTree.parse(times).iter("testcase")
         }
 
-    def tests(self, change: Change) -> list[str]:
-        """Return tests that execute a line, the quickest first, `SECONDS` in all."""
+    def tests(self, change: Change, wide: bool) -> list[str]:
+        """Return tests that execute a line, the quickest first, `SECONDS` in all.
+
+        Args:
+            change: of the line.
+            wide: take those that execute any line of its module.
+        """
         path = str(ROOT / PACKAGE / change.path)
         if path not in self._contexts:
             self._contexts[path] = self._data.contexts_by_lineno(path)
         lines = self._contexts[path]
         # what an import executes, as constants are, all tests of the module may notice
-        import_only = "" in lines.get(change.line, [])
-        contexts = chain(*lines.values()) if import_only else lines.get(change.line, [])
+        own = lines.get(change.line, [])
+        contexts = chain(*lines.values()) if wide or "" in own else own
         names = {context.split("|")[0] for context in contexts if context}
         # what mirrors the folder comes first: these tests are meant for it
         folder = f"tests/{change.path.rsplit('/', 1)[0]}/"
@@ -138,10 +145,9 @@ def _copied(tree: Path) -> Path:
 
 
 def _judge(
-    change: Change, measured: Measured, trees: SimpleQueue[Path]
+    change: Change, tests: list[str], trees: SimpleQueue[Path]
 ) -> tuple[str, str]:
     """Return whether a change was noticed, lived or has no test, and the test."""
-    tests = measured.tests(change)
     if not tests:
         return "no test", ""
     tree = trees.get()
