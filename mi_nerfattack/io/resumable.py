@@ -254,7 +254,7 @@ def content_of(value: str) -> str:
 def _as_file(value: str | None) -> dict[str, Any] | None:
     try:
         entry = json.loads(value or "")
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     is_file = isinstance(entry, dict) and {"file", "sha256"} <= set(entry)
     return entry if is_file else None

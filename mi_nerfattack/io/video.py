@@ -159,6 +159,20 @@ def decode_video(path: Path, raw: bytes) -> Iterator[tuple[Any, int]]:
         raise damaged_video(path, error) from error
 
 
+def rgb_of(path: Path, frame: Any) -> np.ndarray:
+    """Return the picture (h, w, 3) uint8 of one of PyAV's frames.
+
+    Raises:
+        InputError: its pixels are of a kind that FFmpeg does not convert.
+    """
+    from av.error import FFmpegError
+
+    try:
+        return frame.to_ndarray(format="rgb24")
+    except FFmpegError as error:
+        raise damaged_video(path, error) from error
+
+
 def damaged_video(path: Path, error: Exception) -> InputError:
     """Return what is raised for a video that FFmpeg cannot read."""
     return InputError(f"{path}: damaged or truncated video ({error}); copy it again")

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import tomlkit
 from pydantic import PlainSerializer, PlainValidator, ValidationInfo, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
@@ -102,6 +103,8 @@ def _path(value: Any, info: ValidationInfo) -> NamedFile:
         return value
     if not isinstance(value, str):
         raise PydanticCustomError("file", "must be a path, as text")
+    if "\0" in value:
+        raise PydanticCustomError("file", "has a null character, as no file's name has")
     try:
         return NamedFile(value, resolve(value, (info.context or {}).get("folder", "")))
     except InputError as err:
@@ -177,3 +180,15 @@ def section_content(section: Section) -> dict[str, Any]:
             values.pop(str(key))
             values[f"{key}_sha256"] = value.content()["sha256"]
     return values
+
+
+def portable_text(section: Section, text: str) -> str:
+    """Name the files of a section in its text so that it replays anywhere."""
+    document = tomlkit.parse(text)
+    for (*way, last), value in section.leaves():
+        if isinstance(value, NamedFile):
+            table: Any = document
+            for part in way:
+                table = table[part]
+            table[last] = value.portable
+    return tomlkit.dumps(document)

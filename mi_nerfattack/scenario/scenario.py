@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import tomlkit
 from pydantic import Field, ValidationError, model_validator
 
 from mi_nerfattack.errors import InputError
@@ -33,7 +32,7 @@ from mi_nerfattack.scenario.deployment import (
     RenderedDeployment,
     labelled,
 )
-from mi_nerfattack.scenario.named_file import File, NamedFile
+from mi_nerfattack.scenario.named_file import File, NamedFile, portable_text
 from mi_nerfattack.scenario.objective import ObjectiveSection
 from mi_nerfattack.scenario.policy import (
     PilotNetSection,
@@ -59,6 +58,9 @@ _LAYER = re.compile(r"scene\d*|background|cost|input")  # of frames, beside obje
 
 Triple = tuple[Finite, Finite, Finite]
 Row = tuple[Finite, Finite, Finite, Finite]
+
+_LONGEST = 1_000_000  # control periods of a drive
+Periods = Annotated[int, Field(ge=1, lt=_LONGEST)]
 
 
 class SceneSection(Section):
@@ -134,7 +136,7 @@ class DriveSection(Section):
 
     start_m: NonNegative = 0.0  # along the route: the nominal pose
     length_m: Positive | None = None  # of a drive; to the end of the route, or one lap
-    horizon: Count | None = None  # control periods of a drive, in place of length_m
+    horizon: Periods | None = None  # of a drive, in place of length_m
     runs: Count = 4  # drives of each case but random
     lateral_sd_m: NonNegative = 0.1
     heading_sd_deg: NonNegative = 0.5
@@ -148,12 +150,20 @@ class DriveSection(Section):
         Args:
             route: that is driven, with the vehicle's speed.
             period: seconds between two controls.
+
+        Raises:
+            InputError: a million periods or more.
         """
         if self.horizon is not None:
             return self.horizon
         rest = route.length if route.closed else route.length - self.start_m
         length = rest if self.length_m is None else self.length_m
-        return max(1, int(length / (route.speed_ms * period) + 1e-6))
+        if (periods := length / (route.speed_ms * period)) >= _LONGEST:
+            raise InputError(
+                f"drive.length_m: {length:g} m are {periods:.3g} control periods; "
+                f"allowed are fewer than {_LONGEST}"
+            )
+        return max(1, int(periods + 1e-6))
 
     def stretch(self, route: Route, period: float) -> tuple[float, float]:
         """Return the arc lengths, metres, from which and to which is driven.
@@ -387,15 +397,3 @@ def load_scenario(
     objects = [o.model_copy(update={"field": field}) for o in scenario.objects]
     scenario = scenario.model_copy(update={"objects": tuple(objects)})
     return scenario, portable_text(scenario, text)
-
-
-def portable_text(scenario: Scenario, text: str) -> str:
-    """Name the files of a scenario in its text so that it replays anywhere."""
-    document = tomlkit.parse(text)
-    for (*way, last), value in scenario.leaves():
-        if isinstance(value, NamedFile):
-            table: Any = document
-            for part in way:
-                table = table[part]
-            table[last] = value.portable
-    return tomlkit.dumps(document)

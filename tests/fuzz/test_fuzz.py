@@ -33,6 +33,23 @@ def test_damaged_files_are_read_or_refused():
     fuzz("--count", COUNT)
 
 
+#: Numbers of inputs that once escaped, drawn by the seed of `tried.csv`.
+ESCAPED = {
+    "scenario": [8181],
+    "grid": [26944, 34681],
+    "onnx": [2108],
+    "checkpoint": [5544],
+    "zed": [7987],
+    "video": [13528],
+}
+
+
+@pytest.mark.parametrize("name", ESCAPED)
+def test_inputs_that_once_escaped(name):
+    for number in ESCAPED[name]:
+        fuzz(name, "--seed", 20261128, "--only", number)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FORMATS)
 def test_many_damaged_files_are_read_or_refused(name):

@@ -16,7 +16,8 @@ from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.scenario import deployment
 from mi_nerfattack.scenario.deployment import Deployment, deployments, labelled
-from mi_nerfattack.scenario.scenario import load_scenario, portable_text
+from mi_nerfattack.scenario.named_file import portable_text
+from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.scenario.vehicle import AckermannSection
 
 TABLE, TABLES = "[deployment]\n", "[[deployment]]\n"

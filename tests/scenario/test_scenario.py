@@ -12,8 +12,8 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.io.resumable import differences
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.render.camera.intrinsics import Camera
-from mi_nerfattack.scenario.named_file import NamedFile
-from mi_nerfattack.scenario.scenario import load_scenario, portable_text
+from mi_nerfattack.scenario.named_file import NamedFile, portable_text
+from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.scenario.world import initial_states
 from mi_nerfattack.scenes import resolve
 from mi_nerfattack.vehicle.route.route import Route

@@ -14,7 +14,7 @@ from mi_nerfattack.capture.colmap.follow import StageCallback
 from mi_nerfattack.capture.colmap.process import LEAST_IMAGES
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
-from mi_nerfattack.io.video import MAX_VIDEO_BYTES, decode_video
+from mi_nerfattack.io.video import MAX_VIDEO_BYTES, decode_video, rgb_of
 from mi_nerfattack.ranges import Count, Positive, checked
 
 _SMALL_PX = 256  # longer edge at which sharpness and motion are measured
@@ -219,7 +219,7 @@ def extract_frames(
     for frame in _pick(path, raw, chosen):
         name = f"frame_{chosen[len(times)]:06d}.jpg"
         times[name] = float("nan") if frame.time is None else frame.time
-        files.write_image(folder / name, _upright(frame))
+        files.write_image(folder / name, _upright(path, frame))
         progress("frames", len(times), len(chosen))
     return times
 
@@ -233,6 +233,6 @@ def _pick(path: Path, raw: bytes, chosen: Sequence[int]) -> Iterator[Any]:
             return
 
 
-def _upright(frame: Any) -> np.ndarray:
+def _upright(video: Path, frame: Any) -> np.ndarray:
     """Return the picture as it is shown: phones store it turned, and say so."""
-    return np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90) % 4)
+    return np.rot90(rgb_of(video, frame), round(frame.rotation / 90) % 4)

@@ -11,7 +11,7 @@ from mi_nerfattack.car.camera.preparation import AbstractPreparation, check_size
 from mi_nerfattack.car.devices import AbstractCamera, Clock, DeviceLostError, Frame
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
-from mi_nerfattack.io.video import MAX_VIDEO_BYTES, decode_video
+from mi_nerfattack.io.video import MAX_VIDEO_BYTES, decode_video, rgb_of
 
 
 class VideoCamera(AbstractCamera):
@@ -65,7 +65,7 @@ class VideoCamera(AbstractCamera):
         if shown is not None:
             time_s, frame = shown
             check_size(str(self._path), frame.width, frame.height, self._prepare)
-            image = self._prepare.apply(frame.to_ndarray(format="rgb24"))
+            image = self._prepare.apply(rgb_of(self._path, frame))
             self._frame = Frame(image, self._start_s + time_s, index)
         elif self._due is None and self._frame is not None:
             if self._clock() >= self._frame.time_s + self._step_s:

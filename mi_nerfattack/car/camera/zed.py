@@ -208,9 +208,11 @@ class LeftEye(AbstractPreparation):
         x, y = ray_slopes(camera)
         k1, k2, _, _, k3, k4, k5, k6 = (*eye.distortion, 0.0, 0.0, 0.0)[:8]
         r = np.linspace(0, float(np.hypot(x, y).max()), 1000)
-        top = np.polynomial.Polynomial([1, k1, k2, k3])(r * r)
-        below = np.polynomial.Polynomial([1, k4, k5, k6])(r * r)
-        if not ((below > 0).all() and (np.diff(r * top / below) > 0).all()):
+        with np.errstate(all="ignore"):  # an overflow is refused, too
+            top = np.polynomial.Polynomial([1, k1, k2, k3])(r * r)
+            below = np.polynomial.Polynomial([1, k4, k5, k6])(r * r)
+            grows = (np.diff(r * top / below) > 0).all()
+        if not ((below > 0).all() and grows):
             raise InputError(
                 f"{eye.where}: distortion {eye.distortion} folds the image over itself "
                 "where the camera looks; check the file, or take one that sees less"

@@ -25,6 +25,7 @@ from mi_nerfattack.io.video import (
     damaged_video,
     decode_video,
     open_video,
+    rgb_of,
     video_stream,
 )
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
@@ -73,7 +74,7 @@ class VideoRecording(AbstractRecording):
                 )
             self._at += 1
             if self._at == index:
-                self._shown = frame.to_ndarray(format="rgb24")
+                self._shown = rgb_of(self._path, frame)
         where = f"{self._path}: frame {index}"
         return checked_image(where, self._shown, self.camera)
 

@@ -12,7 +12,7 @@ from mi_nerfattack.experiment.sweep.grid import axis_name
 from mi_nerfattack.experiment.sweep.sweep import Cells
 from mi_nerfattack.experiment.transfer.found import FoundAttack, read_found
 from mi_nerfattack.io import files, locks
-from mi_nerfattack.scenario.scenario import portable_text
+from mi_nerfattack.scenario.named_file import portable_text
 from mi_nerfattack.system.workers import AbstractWorkers, raise_failure, tally
 
 

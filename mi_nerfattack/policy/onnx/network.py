@@ -347,8 +347,9 @@ def _tensor(tensor: Any, owner: str) -> torch.Tensor:
             return torch.from_numpy(array.astype(_WHOLE.get(array.dtype, array.dtype)))
         double = array.dtype == np.float64
         return torch.from_numpy(array.astype(np.float64 if double else np.float32))
-    except (TypeError, ValueError) as err:
-        raise InputError(f"{owner}: tensor {tensor.name!r}: {err}") from err
+    except (KeyError, TypeError, ValueError) as err:
+        why = f"unknown type {err}" if isinstance(err, KeyError) else err
+        raise InputError(f"{owner}: tensor {tensor.name!r}: {why}") from err
 
 
 #: Types that torch lacks or hardly computes with.
