@@ -11,7 +11,6 @@ from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
-import tomllib
 import tyro
 
 from bench.results import Progress, progress
@@ -20,6 +19,7 @@ from mi_nerfattack import variant
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.commands.shared.terminal import Result
 from mi_nerfattack.experiment.sweep.grid import load_cells
+from mi_nerfattack.io.strict import parse_toml
 from mi_nerfattack.ranges import Count
 from mi_nerfattack.scenario.scenario import Scenario
 from mi_nerfattack.scenario.world import World, build_attack, build_world
@@ -56,7 +56,7 @@ class BenchRoughness:
             for cell in load_cells(PLACES):
                 place = f"{cell.route}, {cell.objects}"
                 if rows.empty or place not in set(rows["place"]):
-                    scenario = Scenario.model_validate(tomllib.loads(cell.text))
+                    scenario = Scenario.model_validate(parse_toml(PLACES, cell.text))
                     found = pd.DataFrame(_measure(scenario, self.changes, show))
                     found.insert(0, "place", place)
                     rows = pd.concat([rows, found], ignore_index=True)
@@ -115,7 +115,7 @@ def lines(rows: pd.DataFrame) -> list[str]:
     ]
     head = ["place", "rays", "objective", "standard deviation", "share"]
     return [
-        *markdown([head, *table]),
+        markdown(head, table),
         *(
             f"{rays} rays: at most {worst[rays]:.3%}; an iteration costs "
             f"{ratio[rays]:.2f} times that of 1 ray"

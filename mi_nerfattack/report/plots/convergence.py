@@ -61,11 +61,11 @@ def _draw_gains(
     axis: Axes, at: np.ndarray, history: Sequence[Mapping[str, float]]
 ) -> None:
     """Draw what the gradient predicted of each iteration, and what came."""
-    for key, label, look in (
-        ("predicted_gain", "predicted by the gradient", {"color": PALETTE[2]}),
-        ("gain", "came", {"color": ORANGE, "marker": ".", "linewidth": 0.8}),
+    for key, label, color in (
+        ("predicted_gain", "predicted by the gradient", PALETTE[2]),
+        ("gain", "came", ORANGE),
     ):
-        axis.plot(at, [entry[key] for entry in history], label=label, **look)
+        axis.plot(at, [entry[key] for entry in history], color=color, label=label)
     axis.set_yscale("symlog", linthresh=0.1)
     axis.set_ylabel("gain")
     axis.grid(alpha=0.25)
