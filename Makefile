@@ -41,7 +41,7 @@ test-slow: $(VENV)/.installed-test
 
 test-all: test test-slow
 
-# It goes on. Others: make test-fuzz FUZZ="scenario --seeds 3 --table build/fuzz.csv"
+# Continues an interrupted campaign. Other formats or seeds: make test-fuzz FUZZ="scenario --seeds 3 --table build/fuzz.csv"
 test-fuzz: $(VENV)/.installed-test
 	PYTHONPATH=tests $(VENV)/bin/python -m fuzz.campaign $(FUZZ)
 

@@ -27,8 +27,6 @@ class IterationRecord:
         cross_track_mean_m: mean |e| over steps and poses, metres.
         cross_track_max_m: largest |e|, metres.
         costs: of each pose, before their reduction; of a search, none.
-        predicted_gain: by how much the objective falls in the update that follows, by
-            the gradient; None without one.
     """
 
     iteration: int
@@ -36,7 +34,6 @@ class IterationRecord:
     cross_track_mean_m: float
     cross_track_max_m: float
     costs: tuple[float, ...] = ()
-    predicted_gain: float | None = None
 
 
 class AbstractAttack(ABC):
@@ -131,17 +128,17 @@ class AbstractAttack(ABC):
 
     def rows(self) -> list[dict[str, Any]]:
         """Return the history as ``attack.json`` has it, once finished."""
-        rows = map(asdict, self.history)
-        return [{k: v for k, v in row.items() if v is not None} for row in rows]
+        return [asdict(record) for record in self.history]
 
     @property
     def least_gain(self) -> dict[str, Any] | None:
-        """Where the gradient predicted a gain that hardly came, once finished.
+        """Five iterations in a row that gave the least of the predicted gain.
+
+        Once finished. Of iterations that add up to a predicted fall of the objective.
 
         Returns:
-            five iterations in a row, by the `first`, what they had `predicted` of the
-            objective, and what `came`: those with the least share. None without a
-            gradient, and where there are fewer.
+            the index of the `first`, the gain that the gradient `predicted`, and the
+            real `gain`. None without a gradient, and where there are no such five.
         """
         return None
 
@@ -231,17 +228,14 @@ def history_tensors(history: Sequence[IterationRecord]) -> dict[str, np.ndarray]
 
     Returns:
         ``history`` (n, 4), the numbers of :class:`IterationRecord`; ``costs``, those of
-        all iterations end to end; ``cost_counts`` (n,), how many each has;
-        ``predicted_gains``, of each or of none.
+        all iterations end to end; ``cost_counts`` (n,), how many each has.
     """
-    rows = [astuple(record)[:4] for record in history]
-    gains = [r.predicted_gain for r in history if r.predicted_gain is not None]
+    rows = [astuple(record)[:-1] for record in history]
     costs = [cost for record in history for cost in record.costs]
     return {
         "history": np.array(rows, np.float64).reshape(-1, 4),
         "costs": np.array(costs, np.float64),
         "cost_counts": np.array([len(record.costs) for record in history], np.int64),
-        "predicted_gains": np.array(gains, np.float64),
     }
 
 
@@ -255,14 +249,10 @@ def read_history(tensors: dict[str, np.ndarray]) -> list[IterationRecord]:
     rows, counts, costs = (tensors[k] for k in ("history", "cost_counts", "costs"))
     if counts.shape != rows.shape[:1] or counts.sum() != len(costs):
         raise InputError(f"{len(rows)} iterations, costs of {len(counts)}")
-    gains = tensors["predicted_gains"].tolist()
-    if len(gains) not in (0, len(rows)):
-        raise InputError(f"{len(rows)} iterations, predicted gains of {len(gains)}")
-    parts = [part.tolist() for part in np.split(costs, np.cumsum(counts))[:-1]]
-    told = zip(rows.tolist(), parts, gains or [None] * len(rows), strict=True)
+    parts = np.split(costs, np.cumsum(counts)[:-1])
     return [
-        IterationRecord(int(at), *numbers, costs=tuple(part), predicted_gain=gain)
-        for (at, *numbers), part, gain in told
+        IterationRecord(int(iteration), *numbers, costs=tuple(part.tolist()))
+        for (iteration, *numbers), part in zip(rows.tolist(), parts, strict=False)
     ]
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -31,7 +30,7 @@ from mi_nerfattack.rollout.sweep import Gradient, differentiable
 from mi_nerfattack.vehicle.route.route import Route
 
 OFFSETS = "offsets"
-_ROW = 5  # iterations, of which the predicted gain is compared with what came
+_WINDOW = 5  # iterations whose predicted and real gains are compared
 
 #: Parameters of the objects' textures, (n, 3) each, by the optimiser's key.
 Parameters = dict[str, np.ndarray]
@@ -55,6 +54,10 @@ class GradientAttack(AbstractAttack):
         one_level: march objects as one level while they are optimised, see
             `fields.one_level.OneLevel`.
 
+    Attributes:
+        predicted_gains: by how much the objective was to fall in the update after each
+            iteration, by the gradient.
+
     Raises:
         InputError: `one_level`, with a colouring that steps in other parameters than
             the colours of a level.
@@ -76,6 +79,7 @@ class GradientAttack(AbstractAttack):
         self.schedule: Schedule = schedule or Schedule(sys.maxsize)
         self.one_level = one_level
         self.optimiser: Adam = Adam(lr=1.0)
+        self.predicted_gains: list[float] = []
         self._colourings: dict[str, AbstractColouring] = {}
         self._best: Parameters = {}  # of the iteration with the least objective
         self._last: IterationRecord | None = None  # what the last update gave
@@ -122,7 +126,8 @@ class GradientAttack(AbstractAttack):
         values = self._values(gradient)
         self.whole = False
         gain = self._update(values)
-        self.history.append(replace(record, predicted_gain=gain))
+        self.history.append(record)
+        self.predicted_gains.append(gain)
         self.whole = True
         return record
 
@@ -166,10 +171,11 @@ class GradientAttack(AbstractAttack):
         return self._textures(self._best)
 
     def rows(self) -> list[dict[str, Any]]:
-        """See ``AbstractAttack.rows``; `gain` is what came of the predicted one."""
+        """See ``AbstractAttack.rows``; with the predicted and the real gain."""
+        gains = zip(super().rows(), self.predicted_gains, self._gains, strict=True)
         return [
-            row | {"gain": float(gain)}
-            for row, gain in zip(super().rows(), self._gains, strict=True)
+            row | {"predicted_gain": predicted, "gain": float(gain)}
+            for row, predicted, gain in gains
         ]
 
     @property
@@ -182,16 +188,16 @@ class GradientAttack(AbstractAttack):
         count = self.schedule.full(self._objectives)
         if self.has_converged:
             count -= count // 5
-        predicted = [record.predicted_gain or 0.0 for record in self.history[:count]]
-        if count < _ROW:
-            return None
-        said, came = (
-            np.convolve(gains, np.ones(_ROW), "valid")
-            for gains in (predicted, self._gains[:count])
-        )
-        first = int(np.argmin(came / np.maximum(said, 1e-300)))
-        row = {"predicted": float(said[first]), "came": float(came[first])}
-        return {"first": first, **row}
+        windows = [
+            {
+                "first": first,
+                "predicted": sum(self.predicted_gains[first : first + _WINDOW]),
+                "gain": float(self._gains[first : first + _WINDOW].sum()),
+            }
+            for first in range(count - _WINDOW + 1)
+        ]
+        falling = [window for window in windows if window["predicted"] > 0]
+        return min(falling, key=lambda w: w["gain"] / w["predicted"], default=None)
 
     @property
     def _gains(self) -> np.ndarray:
@@ -301,6 +307,7 @@ class GradientAttack(AbstractAttack):
         """Return the complete state as arrays."""
         return {
             **history_tensors(self.history),
+            "predicted_gains": np.array(self.predicted_gains, np.float64),
             **adam_tensors(self.optimiser),
             **{f"best.{key}": best for key, best in self._best.items()},
             "best_mean_m": np.array([self.best_mean_m]),
@@ -310,7 +317,7 @@ class GradientAttack(AbstractAttack):
 
     def load_tensors(self, tensors: dict[str, np.ndarray]) -> None:
         """See `AbstractAttack.load_tensors`."""
-        self.history = read_history(tensors)
+        self._read_history(tensors)
         self.best_mean_m = float(tensors["best_mean_m"][0])
         self.best_objective = float(tensors["best_objective"][0])
         self.best_offsets = np.array(tensors["best_offsets"])
@@ -335,7 +342,7 @@ class GradientAttack(AbstractAttack):
         Raises:
             KeyError: an entry is missing.
         """
-        self.history = read_history(tensors)
+        self._read_history(tensors)
         self.best_objective = np.inf
         for key in [key for key in self.optimiser if f"value.{key}" in tensors]:
             name, moved = f"value.{key}", key == OFFSETS
@@ -346,6 +353,12 @@ class GradientAttack(AbstractAttack):
                 self.best_offsets = project(tensors["best_offsets"])
             else:
                 self._best[key] = project(tensors[f"best.{key}"])
+
+    def _read_history(self, tensors: dict[str, np.ndarray]) -> None:
+        history, gains = read_history(tensors), tensors["predicted_gains"].tolist()
+        if len(gains) != len(history):
+            raise InputError(f"{len(history)} iterations, {len(gains)} predicted gains")
+        self.history, self.predicted_gains = history, gains
 
     def _record(
         self, seen: Evaluation, colours: Parameters | None = None

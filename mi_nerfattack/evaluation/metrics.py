@@ -282,7 +282,7 @@ class _Optimised(_Model):
 class _Gain(_Model):
     first: Whole
     predicted: float
-    came: float
+    gain: float
 
 
 class _Bricks(_Optimised):

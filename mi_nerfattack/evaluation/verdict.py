@@ -130,8 +130,8 @@ SATURATED = 0.5
 #: An object is hardly in view below this share of the pixels, on average over a drive.
 HARDLY = 0.001
 
-#: A gradient misleads where less than this share of the gain that it predicts comes.
-COMES = 0.01
+#: A gradient misleads where the real gain is less than this share of the predicted one.
+LEAST_SHARE = 0.01
 
 #: `frames` rendered, increasing, and the least `objective` until then, a number each.
 Curve = Mapping[str, Sequence[float]]
@@ -171,12 +171,11 @@ def run_flags(
 
 
 def _misleading(gain: Figures) -> Iterator[str]:
-    if gain["came"] < COMES * gain["predicted"]:
+    if gain["gain"] < LEAST_SHARE * gain["predicted"]:
         yield (
             f"gradient misleads: for the five iterations from {gain['first']} on, it "
             f"predicted that the objective falls by {gain['predicted']:.3g}; it fell "
-            f"by {gain['came']:.3g}; the gradient holds camera poses that the drive "
-            "does not; try a lower learning rate, or other starts"
+            f"by {gain['gain']:.3g}; try a lower learning rate, or other starts"
         )
 
 

@@ -25,7 +25,7 @@ from mi_nerfattack.rollout.drive import NO_OBJECT, OWN, RANDOM, Drive
 from mi_nerfattack.rollout.loop import OnStep
 from mi_nerfattack.scenario.deployment import SURROGATE, labelled
 from mi_nerfattack.scenario.named_file import section_content
-from mi_nerfattack.scenario.scenario import Scenario, is_within
+from mi_nerfattack.scenario.scenario import SURROGATE_KEYS, Scenario, is_within
 from mi_nerfattack.scenario.world import Appearance, World, build_world
 from mi_nerfattack.system.workers import AbstractWorkers, tally
 
@@ -42,8 +42,6 @@ SEARCH_KEYS = (
     "scene.bricks",
     "drive.runs",
 )
-#: Parts that only drives in the surrogate depend on.
-_SURROGATE_KEYS = ("field", "composite", "spp", "step_m", "stop", "to_world")
 
 
 def decisive(
@@ -67,7 +65,7 @@ def decisive(
         seed = f"{scenario.seed}" if random else "none"
         named = {"random": seed, "attached": f"{own.attached}"}
     else:
-        inert += [f"scene.{name}" for name in _SURROGATE_KEYS]
+        inert += [f"scene.{name}" for name in SURROGATE_KEYS]
     return named | {k: v for k, v in identity.items() if not is_within(k, inert)}
 
 

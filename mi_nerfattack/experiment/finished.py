@@ -57,6 +57,17 @@ class Finished:
         return look
 
     @property
+    def history(self) -> list[dict[str, Any]]:
+        """A row an iteration, for ``attack.json``.
+
+        Without gains where changes were ignored, as :attr:`curve`.
+        """
+        rows, gains = self.attack.rows(), ("predicted_gain", "gain")
+        if not self.ignored:
+            return rows
+        return [{k: v for k, v in row.items() if k not in gains} for row in rows]
+
+    @property
     def curve(self) -> dict[str, list[float]] | None:
         """What the attack had found after how many frames, for ``metrics.json``.
 

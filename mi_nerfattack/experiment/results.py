@@ -93,7 +93,7 @@ def write_results(
     Returns:
         the document that ``metrics.json`` holds.
     """
-    history = done.attack.rows()
+    history = done.history
     path = output / METRICS
     _write_tables(output, done, history)
     document = _describe(done, effort)

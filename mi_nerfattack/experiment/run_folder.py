@@ -24,7 +24,7 @@ from mi_nerfattack.io.resumable import (
 )
 from mi_nerfattack.system.machine import peak_memory_mb, peak_of_children_mb
 
-CHECKPOINT_FORMAT = "mi_nerfattack attack checkpoint 9"
+CHECKPOINT_FORMAT = "mi_nerfattack attack checkpoint 10"
 REMEDY = (
     "go on with the scenario.toml of the run folder and the same files and versions, "
     "start a new run folder, or ignore this (--force)"

@@ -73,9 +73,9 @@ class NamedFile:
     def content(self) -> dict[str, str]:
         """Return the name without its folder, and the SHA-256 of the content.
 
-        An XML file counts with the files that it and included ones name; a folder with
-        all that lies in it. Of an installed module, its own source counts; the name
-        where it has none.
+        An XML file counts with the files that it and included ones name; the folder of
+        a recording with all that lies in it. Of an installed module, its own source
+        counts; the name where it has none.
 
         Raises:
             InputError: the file cannot be read.
@@ -112,7 +112,7 @@ def _path(value: Any, info: ValidationInfo) -> NamedFile:
 
 
 def _file(value: Any, info: ValidationInfo) -> NamedFile:
-    """Find what is no folder, which could hold a whole disk."""
+    """Find a file; refuse a folder, of which everything would be hashed."""
     named = _path(value, info)
     if named.path is not None and os.path.isdir(named.path):
         raise PydanticCustomError("file", "is a folder; a file is needed")

@@ -59,6 +59,8 @@ _LAYER = re.compile(r"scene\d*|background|cost|input")  # of frames, beside obje
 Triple = tuple[Finite, Finite, Finite]
 Row = tuple[Finite, Finite, Finite, Finite]
 
+#: Of `[scene]`, what only drives in the surrogate depend on.
+SURROGATE_KEYS = ("field", "composite", "spp", "step_m", "stop", "to_world")
 _LONGEST = 1_000_000  # control periods of a drive
 Periods = Annotated[int, Field(ge=1, lt=_LONGEST)]
 
@@ -100,15 +102,7 @@ class SceneSection(Section):
             if self.field is None:
                 refuse("field", "is missing; give it, or surrogate")
             return self
-        for key in (
-            "field",
-            "bricks",
-            "composite",
-            "spp",
-            "step_m",
-            "stop",
-            "to_world",
-        ):
+        for key in ("bricks", *SURROGATE_KEYS):
             if getattr(self, key) != self.defaults()[key]:
                 refuse(key, f"{self.surrogate} says it; leave out this, or surrogate")
         return self

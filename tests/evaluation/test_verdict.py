@@ -120,9 +120,9 @@ def test_a_good_run_raises_none(document):
 
 
 def test_a_gradient_of_which_hardly_anything_comes_is_told(document):
-    document["least_gain"] = {"first": 7, "predicted": 40.0, "came": 0.4}
+    document["least_gain"] = {"first": 7, "predicted": 40.0, "gain": 0.4}
     check(document, "")
-    document["least_gain"]["came"] = 0.399
+    document["least_gain"]["gain"] = 0.399
     check(document, "gradient misleads", "from 7 on", "falls by 40", "by 0.399")
 
 

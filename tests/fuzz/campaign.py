@@ -1,8 +1,9 @@
 """Try many damaged files: ``python -m fuzz.campaign`` with `tests` as a path.
 
 Inputs are tried in pieces, and the table gets a row as a piece ends: its format, seed,
-first number, count, the commit, and what failed. What has a row is not tried again, so
-that a campaign goes on after an interruption, also on another day or machine.
+first number, count, the commit, and what failed. A piece of which nothing failed is not
+tried again, so that a campaign continues after an interruption, also on another day or
+machine.
 """
 
 from __future__ import annotations
@@ -17,10 +18,14 @@ from pathlib import Path
 import pandas as pd
 from fuzz.formats import FORMATS
 
+from mi_nerfattack.io import files
+
 ROOT = Path(__file__).parents[2]
 TABLE = Path(__file__).with_name("tried.csv")
 COLUMNS = ["format", "seed", "first", "count", "commit", "failed"]
 PIECE = 10_000
+#: Format, seed, first number, count.
+Piece = tuple[str, int, int, int]
 MEMORY = Path("/dev/shm")  # files there are not written to a disk
 
 
@@ -32,26 +37,30 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, nargs="+", default=[20261128, 20261129])
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     parser.add_argument("--table", type=Path, default=TABLE)
-    given = parser.parse_args()
-    done = _read(given.table)
-    keys = set(map(tuple, done[COLUMNS[:4]].to_numpy()))
-    count = min(PIECE, given.count)
+    options = parser.parse_args()
+    rows = _read(options.table)
     waiting = [
-        (name, seed, first, count)
-        for seed in given.seeds
-        for first in range(0, given.count, PIECE)
-        for name in given.formats
-        if (name, seed, first, count) not in keys
+        (name, seed, first, min(PIECE, options.count - first))
+        for seed in options.seeds
+        for first in range(0, options.count, PIECE)
+        for name in options.formats
     ]
-    commit = _output("git", "rev-parse", "--short", "HEAD").strip()
-    with ThreadPoolExecutor(given.workers) as pool:
+    waiting = [p for p in waiting if p not in rows or rows[p][1]]
+    commit, failures = _commit(), 0
+    pool = ThreadPoolExecutor(options.workers)
+    try:
         running = {pool.submit(_tried, *piece): piece for piece in waiting}
         for ended in as_completed(running):
             piece, failed = running[ended], ended.result()
-            done.loc[len(done)] = [*piece, commit, failed]
-            done.sort_values(COLUMNS[:4]).to_csv(given.table, index=False)
+            rows[piece] = commit, failed
+            failures += bool(failed)
+            lines = [(*piece, *row) for piece, row in sorted(rows.items())]
+            text = pd.DataFrame(lines, columns=COLUMNS).to_csv(index=False)
+            files.write_text(options.table, text)
             print(*piece, failed or "all read or refused", flush=True)
-    return int((done["failed"] != "").any())
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return int(failures > 0)
 
 
 def _tried(name: str, seed: int, first: int, count: int) -> str:
@@ -64,17 +73,26 @@ def _tried(name: str, seed: int, first: int, count: int) -> str:
         stderr=subprocess.DEVNULL,
         text=True,
     )
-    return result.stdout.strip() if result.returncode else ""
+    failed = result.stdout.strip()
+    if result.returncode not in (0, 1) or bool(result.returncode) != bool(failed):
+        raise SystemExit(f"{' '.join(map(str, words))}: ended by {result.returncode}")
+    return failed
 
 
-def _output(*command: str) -> str:
-    return subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True).stdout
+def _commit() -> str:
+    command = ["git", "rev-parse", "--short", "HEAD"]
+    return subprocess.check_output(command, cwd=ROOT, text=True).strip()
 
 
-def _read(table: Path) -> pd.DataFrame:
+def _read(table: Path) -> dict[Piece, tuple[str, str]]:
+    """Return commit and failures of each piece."""
     if not table.exists():
-        return pd.DataFrame(columns=COLUMNS)
-    return pd.read_csv(table, dtype={"commit": str}, keep_default_na=False)
+        return {}
+    read = pd.read_csv(table, dtype={"commit": str}, keep_default_na=False)
+    return {
+        (str(name), int(seed), int(first), int(count)): (str(commit), str(failed))
+        for name, seed, first, count, commit, failed in read.itertuples(index=False)
+    }
 
 
 if __name__ == "__main__":

@@ -88,7 +88,7 @@ def test_texts_that_are_just_allowed(tmp_path):
         ('"scene.safetensors"', f'"bundled:{"a" * 300}"', "bundled file"),
         ('"scene.safetensors"', r'"bundled:\u0000"', "bundled file"),
         ('"scene.safetensors"', f'"{"a" * 300}"', "too long"),
-        ('"scene.safetensors"', '"~"', "is a folder; a file is needed"),
+        ('"scene.safetensors"', '"."', "is a folder; a file is needed"),
         ('file = "policy.safetensors"', 'url = "http://[::1"', "policy.url: "),
     ],
 )

@@ -3,9 +3,9 @@
 One run of all tests says by coverage which of them execute which line, and how long
 each takes. Every change is then made in a copy of the tree, and tests of its line run
 there, the quickest first, until one fails or `SECONDS` are over. The table gets a row
-as a change is judged. What has a row is not done again. With ``--again``, what no test
-noticed is, by tests of all lines of its module: coverage counts what is cached for one
-test alone.
+as a change is judged. What has a row is not done again. With ``--again``, a drawn
+change that no test noticed is, once, by tests of all lines of its module: coverage
+counts what is cached for one test alone.
 """
 
 from __future__ import annotations
@@ -48,9 +48,14 @@ def main() -> int:
     measured = Measured()
     drawn = draw(ROOT / PACKAGE, given.parts, given.count, given.seed)
     rows = _read(given.table)
+    keys = {(change.path, str(change.line), change.after) for change in drawn}
     if given.again:
-        rows = [row for row in rows if row["outcome"] == "noticed"]
-    done = {(row["path"], row["line"], row["after"]) for row in rows}
+        rows = [
+            row
+            for row in rows
+            if row["outcome"] == "noticed" or row["wide"] or _key(row) not in keys
+        ]
+    done = set(map(_key, rows))
     waiting = [c for c in drawn if (c.path, str(c.line), c.after) not in done]
     trees: SimpleQueue[Path] = SimpleQueue()
     for number in range(given.workers):
@@ -60,6 +65,7 @@ def main() -> int:
         judged = pool.map(lambda c: _judge(c, measured.tests(c, wide), trees), waiting)
         for change, (outcome, test) in zip(waiting, judged, strict=True):
             row = {"seed": str(given.seed), "outcome": outcome, "test": test}
+            row["wide"] = "wide" * wide
             columns = ("path", "line", "kind", "before", "after")
             rows.append(row | {name: str(getattr(change, name)) for name in columns})
             pd.DataFrame(rows).to_csv(given.table, index=False)
@@ -69,12 +75,17 @@ def main() -> int:
 
 
 class Measured:
-    """Which tests execute which line of the package, and how long each takes."""
+    """Which tests execute which line of the package, and how long each takes.
+
+    Measured once for each state of the package.
+    """
 
     def __init__(self) -> None:
-        data, times = WORK / "coverage", WORK / "times.xml"
+        command = ["git", "rev-parse", "--short", f"HEAD:{PACKAGE}"]
+        code = subprocess.check_output(command, cwd=ROOT, text=True).strip()
+        data, times = WORK / code / "coverage", WORK / code / "times.xml"
         if not times.exists():
-            WORK.mkdir(parents=True, exist_ok=True)
+            times.parent.mkdir(parents=True, exist_ok=True)
             words = [
                 *("-n", str(os.cpu_count()), "-m", "not slow", "--dist", "worksteal"),
                 *(f"--cov={PACKAGE}", "--cov-context=test", "--cov-report="),
@@ -185,10 +196,15 @@ def _outcome(tree: Path, tests: list[str]) -> tuple[str, str]:
     return "noticed", failed[0] if failed else f"ends with {result.returncode}"
 
 
+def _key(row: dict[Any, Any]) -> tuple[str, str, str]:
+    return row["path"], row["line"], row["after"]
+
+
 def _read(table: Path) -> list[dict[Any, Any]]:
     if not table.exists():
         return []
-    return pd.read_csv(table, dtype=str, na_filter=False).to_dict("records")
+    rows = pd.read_csv(table, dtype=str, na_filter=False).to_dict("records")
+    return [{"wide": "", **row} for row in rows]
 
 
 def _print(rows: list[dict[Any, Any]]) -> None:

@@ -53,6 +53,21 @@ def test_iterations_and_the_best_so_far_are_drawn(monkeypatch):
         assert holds(second, np.stack([curve["frames"], curve[name]], 1))
 
 
+def test_predicted_and_real_gains_are_drawn(monkeypatch):
+    rows = [{"objective": -i, "cross_track_mean_m": 0.1 * i} for i in range(3)]
+    gains = [[5.0, 1.0], [4.0, -0.5], [3.0, 0.1]]
+    keys = "predicted_gain", "gain"
+    history = [
+        r | dict(zip(keys, g, strict=True)) for r, g in zip(rows, gains, strict=True)
+    ]
+    figures = drawn(monkeypatch)
+    convergence("convergence.png", history)
+    (figure,) = figures
+    *_, last = figure.axes
+    for column in np.array(gains).T:
+        assert holds(last, np.stack([range(3), column], 1))
+
+
 def test_maps_and_errors_show_drives_and_objects(monkeypatch):
     """Both environments have a panel, with equal axes."""
     drives = [

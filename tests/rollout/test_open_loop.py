@@ -10,8 +10,8 @@ import pytest
 from support.worlds import loops as toy
 from support.worlds.loops import ADJOINTS
 
-from mi_nerfattack.attack.base import distances
-from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.attack.base import IterationRecord, distances
+from mi_nerfattack.attack.freedom import Freedom, Schedule
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.attack.objectives import CrossTrackDeviation
 from mi_nerfattack.attack.texture.colours import Colours
@@ -123,15 +123,48 @@ def test_small_steps_gain_what_the_gradient_predicts(closed, smoothing):
     again = GradientAttack(opened, toy.ROUTE, initial, freedom)
     again.load_tensors(attack.tensors())
     assert again.history == attack.history
+    assert again.predicted_gains == attack.predicted_gains
     attack.finish()
-    for row in attack.rows():
+    rows, least = attack.rows(), attack.least_gain
+    for row in rows:
         assert row["gain"] == pytest.approx(row["predicted_gain"], rel=0.05)
         assert row["gain"] > 0
-    least, rows = attack.least_gain, attack.rows()
+    assert least["first"] == 0
     assert least["predicted"] == pytest.approx(sum(r["predicted_gain"] for r in rows))
-    assert least["came"] == pytest.approx(
+    assert least["gain"] == pytest.approx(
         rows[0]["objective"] - attack.judged_objective, rel=1e-6
     )
+    with pytest.raises(InputError, match="5 iterations, 4 predicted gains"):
+        again.load_tensors(
+            attack.tensors() | {"predicted_gains": np.array(attack.predicted_gains[1:])}
+        )
+
+
+def test_the_least_gain_is_of_iterations_that_predict_a_fall(closed):
+    """At the full rates: windows of five predict 15, 5, -5, 1 and 0.5."""
+    rollout, initial, _ = closed
+    attack = GradientAttack(rollout, toy.ROUTE, initial, Freedom(0.1))
+    attack.predicted_gains = [11.0, 1.0, 1.0, 1.0, 1.0, 1.0, -9.0, 7.0]
+    falls = [3.0, 1.0, 1.0, 1.0, 1.0, 0.0, -9.0, 6.5]
+    objectives = -np.cumsum([0.0, *falls])
+    attack.history = [IterationRecord(k, v, 0.1, 0.2) for k, v in enumerate(objectives)]
+    attack.predicted_gains.append(0.5)  # whose gain is not known yet: 0
+    assert attack.least_gain == {"first": 4, "predicted": 0.5, "gain": -1.5}
+    attack.schedule = Schedule(12)  # whose rates fall after nine iterations
+    assert attack.schedule.full(list(objectives)) == 9
+    attack.schedule = Schedule(10)  # after eight
+    assert attack.least_gain == {"first": 3, "predicted": 1.0, "gain": -0.5}
+    attack.schedule = Schedule(5)  # after four, which are too few
+    assert attack.least_gain is None
+
+
+def test_gains_of_poses_are_recorded(closed):
+    rollout, initial, _ = closed
+    attack = GradientAttack(rollout, toy.ROUTE, initial, Freedom(None, 0.01))
+    attack.step()  # of poses alone
+    attack.finish()
+    (row,) = attack.rows()
+    assert row["predicted_gain"] > 0 and row["gain"] != 0
 
 
 def test_what_makes_no_sense_is_refused(closed):

@@ -82,6 +82,12 @@ def test_keys_and_xml_describe_the_same_sensor(load):
     assert np.abs(one - other).max() < 1e-4 and one.std() > 0.01
 
 
+@pytest.mark.parametrize("spp", [1, 4])
+def test_rays_per_pixel(load, spp):
+    scenario = load({FIELD: f"{FIELD}\nspp = {spp}"})
+    assert build_surrogate(scenario).camera.spp == spp
+
+
 def test_files_of_the_scene_are_part_of_the_identity(load, tmp_path):
     scenario = load(more='<include filename="wall.xml"/>')
     (tmp_path / "wall.xml").write_text(

@@ -60,10 +60,10 @@ def convergence(
 def _draw_gains(
     axis: Axes, at: np.ndarray, history: Sequence[Mapping[str, float]]
 ) -> None:
-    """Draw what the gradient predicted of each iteration, and what came."""
+    """Draw the gain that the gradient predicted of each iteration, and the real one."""
     for key, label, color in (
         ("predicted_gain", "predicted by the gradient", PALETTE[2]),
-        ("gain", "came", ORANGE),
+        ("gain", "real", ORANGE),
     ):
         axis.plot(at, [entry[key] for entry in history], color=color, label=label)
     axis.set_yscale("symlog", linthresh=0.1)
