@@ -86,7 +86,7 @@ def test_texts_that_are_just_allowed(tmp_path):
         ('"scene.safetensors"', "1979-05-27", "scene.field: "),
         ('"policy.safetensors"', "1979-05-27", "policy.file: "),
         ('"scene.safetensors"', f'"bundled:{"a" * 300}"', "bundled file"),
-        ('"scene.safetensors"', r'"bundled:\u0000"', "bundled file"),
+        ('"scene.safetensors"', r'"bundled:\u0000"', "has a null character"),
         ('"scene.safetensors"', f'"{"a" * 300}"', "too long"),
         ('"scene.safetensors"', '"."', "is a folder; a file is needed"),
         ('file = "policy.safetensors"', 'url = "http://[::1"', "policy.url: "),

@@ -109,7 +109,7 @@ def test_films_that_a_phone_turned_are_shown_upright():
     left[:, :3] = 255
     for angle, bright in ((0, np.s_[:, 0]), (-90, np.s_[0]), (90, np.s_[-1])):
         frame = SimpleNamespace(rotation=angle, to_ndarray=lambda format: left)
-        shown = _upright(frame)
+        shown = _upright(Path("film.mp4"), frame)
         assert shown[bright].min() == 255 and shown.mean() == 127.5
 
 
