@@ -15,6 +15,7 @@ from mi_nerfattack.attack.freedom import Freedom, Schedule
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.attack.objectives import CrossTrackDeviation
 from mi_nerfattack.attack.texture.colours import Colours
+from mi_nerfattack.attack.texture.constraints import Constraints
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.objective import StageSum
@@ -109,11 +110,15 @@ def test_an_attack_by_it_makes_the_closed_loop_worse(closed):
     assert through == distances(toy.ROUTE, evaluation).mean()
 
 
-@pytest.mark.parametrize("smoothing", [0, 2])
-def test_small_steps_gain_what_the_gradient_predicts(closed, smoothing):
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"smoothing": 2}, {"constraints": Constraints(total_variation=0.5)}],
+    ids=str,
+)
+def test_small_steps_gain_what_the_gradient_predicts(closed, options):
     """Of images whose camera stays, which is what a detached gradient is of."""
     rollout, initial, _ = closed
-    colouring = partial(Colours, smoothing=smoothing)
+    colouring = partial(Colours, **options)
     freedom = Freedom(0.003, colouring=colouring)
     opened = rollout.open_loop(initial)
     attack = GradientAttack(opened, toy.ROUTE, initial, freedom)
