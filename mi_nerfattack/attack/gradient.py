@@ -188,11 +188,13 @@ class GradientAttack(AbstractAttack):
         count = self.schedule.full(self._objectives)
         if self.has_converged:
             count -= count // 5
+        # Five iterations in a row each; of those that predict a fall, the least share
+        gains = self._gains
         windows = [
             {
                 "first": first,
                 "predicted": sum(self.predicted_gains[first : first + _WINDOW]),
-                "gain": float(self._gains[first : first + _WINDOW].sum()),
+                "gain": float(gains[first : first + _WINDOW].sum()),
             }
             for first in range(count - _WINDOW + 1)
         ]

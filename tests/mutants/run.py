@@ -27,6 +27,8 @@ import pandas as pd
 from coverage import CoverageData
 from mutants.changes import Change, draw
 
+from mi_nerfattack.io import files
+
 ROOT = Path(__file__).parents[2]
 WORK = ROOT / "build" / "mutants"
 PACKAGE = "mi_nerfattack"
@@ -68,7 +70,7 @@ def main() -> int:
             row["wide"] = "wide" * wide
             columns = ("path", "line", "kind", "before", "after")
             rows.append(row | {name: str(getattr(change, name)) for name in columns})
-            pd.DataFrame(rows).to_csv(given.table, index=False)
+            files.write_text(given.table, pd.DataFrame(rows).to_csv(index=False))
             print(f"{len(rows)}: {outcome} {change.path}:{change.line}", flush=True)
     _print(rows)
     return 0
