@@ -3,9 +3,9 @@
 One run of all tests says by coverage which of them execute which line, and how long
 each takes. Every change is then made in a copy of the tree, and tests of its line run
 there, the quickest first, until one fails or `SECONDS` are over. The table gets a row
-as a change is judged. What has a row is not done again. With ``--again``, a drawn
-change that no test noticed is, once, by tests of all lines of its module: coverage
-counts what is cached for one test alone.
+as a change is judged. What has a row is not done again. With ``--again``, changes of
+the table that no test noticed are made in the code of today and judged by tests of all
+lines of their module: coverage counts what is cached for one test alone.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import Any
 
 import pandas as pd
 from coverage import CoverageData
-from mutants.changes import Change, draw
+from mutants.changes import Change, changes, draw
 
 from mi_nerfattack.io import files
 
@@ -35,6 +35,8 @@ PACKAGE = "mi_nerfattack"
 PARTS = "rollout render evaluation drives attack car/drive/safety car/vesc".split()
 #: Of tests of one change, as they were measured, and of one run beside others.
 SECONDS, LIMIT_S = 60.0, 600.0
+#: A change and its row of the table.
+_Judged = tuple[Change, dict[Any, Any]]
 
 
 def main() -> int:
@@ -45,47 +47,81 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     parser.add_argument("--parts", nargs="*", default=PARTS)
     parser.add_argument("--again", action="store_true")
+    parser.add_argument("--tests", nargs="*", help="judge by these, without measuring")
     parser.add_argument("--table", type=Path, default=WORK / "changes.csv")
     given = parser.parse_args()
-    measured = Measured()
-    drawn = draw(ROOT / PACKAGE, given.parts, given.count, given.seed)
     rows = _read(given.table)
-    keys = {(change.path, str(change.line), change.after) for change in drawn}
+    code = _hash("")
     if given.again:
-        rows = [
-            row
-            for row in rows
-            if row["outcome"] == "noticed" or row["wide"] or _key(row) not in keys
+        waiting = _again(rows, code if given.tests is None else "")
+    else:
+        drawn = draw(ROOT / PACKAGE, given.parts, given.count, given.seed)
+        done = {(*_key(row), row["line"]) for row in rows}
+        waiting = [
+            (change, {"seed": str(given.seed)})
+            for change in drawn
+            if (*_key(vars(change)), str(change.line)) not in done
         ]
-    done = set(map(_key, rows))
-    waiting = [c for c in drawn if (c.path, str(c.line), c.after) not in done]
+    measured = None if given.tests else Measured()
     trees: SimpleQueue[Path] = SimpleQueue()
     for number in range(given.workers):
         trees.put(_copied(WORK / f"tree_{number}"))
+
+    def judged(change: Change) -> tuple[str, str]:
+        tests = measured.tests(change, given.again) if measured else given.tests
+        return _judge(change, tests, trees)
+
     with ThreadPoolExecutor(given.workers) as pool:
-        wide = given.again
-        judged = pool.map(lambda c: _judge(c, measured.tests(c, wide), trees), waiting)
-        for change, (outcome, test) in zip(waiting, judged, strict=True):
-            row = {"seed": str(given.seed), "outcome": outcome, "test": test}
-            row["wide"] = "wide" * wide
+        outcomes = pool.map(judged, [change for change, _ in waiting])
+        for (change, row), (outcome, test) in zip(waiting, outcomes, strict=True):
+            if not given.again:
+                rows.append(row)
             columns = ("path", "line", "kind", "before", "after")
-            rows.append(row | {name: str(getattr(change, name)) for name in columns})
+            row |= {"outcome": outcome, "test": test, "code": code}
+            row |= {name: str(getattr(change, name)) for name in columns}
             files.write_text(given.table, pd.DataFrame(rows).to_csv(index=False))
-            print(f"{len(rows)}: {outcome} {change.path}:{change.line}", flush=True)
+            print(f"{outcome} {change.path}:{change.line}", flush=True)
     _print(rows)
     return 0
+
+
+def _again(rows: list[dict[Any, Any]], code: str) -> list[_Judged]:
+    """Find in the code of today the changes of a table that no test noticed.
+
+    Args:
+        rows: of the table.
+        code: whose rows need not be judged again.
+    """
+    found: list[_Judged] = []
+    for row in rows:
+        path = ROOT / PACKAGE / row["path"]
+        if row["outcome"] == "noticed" or row["code"] == code or not path.exists():
+            continue
+        same = [c for c in changes(row["path"], path.read_text()) if _same(c, row)]
+        if same:
+            line = int(row["line"])
+            found.append((min(same, key=lambda c: abs(c.line - line)), row))
+    return found
+
+
+def _same(change: Change, row: dict[Any, Any]) -> bool:
+    return _key(vars(change)) == _key(row)
+
+
+def _hash(folder: str) -> str:
+    command = ["git", "rev-parse", "--short", f"HEAD:{folder}"]
+    return subprocess.check_output(command, cwd=ROOT, text=True).strip()
 
 
 class Measured:
     """Which tests execute which line of the package, and how long each takes.
 
-    Measured once for each state of the package.
+    Measured once for each state of the package and its tests.
     """
 
     def __init__(self) -> None:
-        command = ["git", "rev-parse", "--short", f"HEAD:{PACKAGE}"]
-        code = subprocess.check_output(command, cwd=ROOT, text=True).strip()
-        data, times = WORK / code / "coverage", WORK / code / "times.xml"
+        measured = WORK / f"{_hash(PACKAGE)}_{_hash('tests')}"
+        data, times = measured / "coverage", measured / "times.xml"
         if not times.exists():
             times.parent.mkdir(parents=True, exist_ok=True)
             words = [
@@ -198,15 +234,15 @@ def _outcome(tree: Path, tests: list[str]) -> tuple[str, str]:
     return "noticed", failed[0] if failed else f"ends with {result.returncode}"
 
 
-def _key(row: dict[Any, Any]) -> tuple[str, str, str]:
-    return row["path"], row["line"], row["after"]
+def _key(row: dict[Any, Any]) -> tuple[str, str, str, str]:
+    return row["path"], row["kind"], row["before"], row["after"]
 
 
 def _read(table: Path) -> list[dict[Any, Any]]:
     if not table.exists():
         return []
     rows = pd.read_csv(table, dtype=str, na_filter=False).to_dict("records")
-    return [{"wide": "", **row} for row in rows]
+    return [{"code": "", **row} for row in rows]
 
 
 def _print(rows: list[dict[Any, Any]]) -> None:
