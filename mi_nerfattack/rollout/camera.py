@@ -11,10 +11,15 @@ import mitsuba as mi
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import CameraMount
 from mi_nerfattack.render.camera.lens import mount_pose
+from mi_nerfattack.rollout.keyed import keyed_sampler
 
 
 class SceneCamera:
     """Rays of a scene's sensor from vehicles, and images of their radiance.
+
+    Rays go through the places in pixels, and on the aperture, that the sensor's own
+    sampler draws for an image; they are the same for all drives. What the integrator
+    draws depends on the drive's number, too. So a drive is the same in any batch.
 
     Args:
         sensor: lens, clip distances, film size and samples per pixel count; its pose
@@ -22,18 +27,24 @@ class SceneCamera:
         mount: pose on the vehicle.
         seed: of all random numbers, renewed each control period.
         centred: let rays go through the middles of n x n squares of a pixel.
+        first: number of the first drive of a batch.
 
     Raises:
         InputError: `centred`, and a number of samples that is no square.
     """
 
     def __init__(
-        self, sensor: Any, mount: CameraMount, seed: int, centred: bool = False
+        self,
+        sensor: Any,
+        mount: CameraMount,
+        seed: int,
+        centred: bool = False,
+        first: int = 0,
     ) -> None:
         self.sensor: Any = sensor
         self.mount: CameraMount = mount
         self.seed: int = seed
-        self.centred = centred
+        self.centred, self.first = centred, first
         if centred and math.isqrt(self.spp) ** 2 != self.spp:
             raise InputError(
                 f"samples per pixel: {self.spp}; rays through the middles of squares "
@@ -98,14 +109,21 @@ class SceneCamera:
     def _draw(self, count: int, step: int) -> tuple[mi.Sampler, Any, mi.Point2f]:
         """Return a sampler, places in pixels (2, n) from 0 to 1, and on apertures."""
         width, height = self.size
-        total = count * width * height * self.spp
-        sampler = self.sensor.sampler().clone()
-        sampler.set_samples_per_wavefront(self.spp)
+        rays = width * height * self.spp
         seed = dr.opaque(mi.UInt32, self.seed), dr.opaque(mi.UInt32, step)
-        sampler.seed(mi.sample_tea_32(*seed)[0], total)
-        within = self._centres(total) if self.centred else sampler.next_2d()
+        sampler = keyed_sampler(*seed, self.first * rays, count * rays)
         lens = self.sensor.needs_aperture_sample()
-        return sampler, within, sampler.next_2d() if lens else mi.Point2f(0)
+        if self.centred and not lens:
+            return sampler, self._centres(count * rays), mi.Point2f(0)
+        own = self.sensor.sampler().clone()
+        own.set_samples_per_wavefront(self.spp)
+        own.seed(mi.sample_tea_32(*seed)[0], rays)
+        within = self._centres(rays) if self.centred else own.next_2d()
+        aperture = own.next_2d() if lens else mi.Point2f(dr.zeros(mi.Float, rays))
+        dr.eval(within, aperture)
+        ray = dr.arange(mi.UInt32, count * rays) % rays
+        within, aperture = (dr.gather(mi.Point2f, x, ray) for x in (within, aperture))
+        return sampler, within, aperture
 
     def eye(self, pose: Any, count: int) -> mi.Point3f:
         """Return where the eye of each ray of :meth:`rays` is, (3, n)."""

@@ -9,7 +9,7 @@ everywhere.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -72,6 +72,15 @@ class ClosedLoop:
         parts = self.sensor, self.policy, self.dynamics, self.integrator
         names = ", ".join(type(part).__name__ for part in parts)
         return f"ClosedLoop({names}, goal {self.goal}, periods of {self.dt:g} s)"
+
+    def numbered(self, first: int) -> ClosedLoop:
+        """Return this loop with a number of the first drive, of which all draws depend.
+
+        A drive alone with the number of its row is the same as in the batch.
+        """
+        disturbance = replace(self.disturbance, first=first)
+        sensor = self.sensor.numbered(first)
+        return replace(self, sensor=sensor, disturbance=disturbance)
 
     def initial(self, poses: np.ndarray) -> Any:
         """Upload initial poses (n, 3), metres and radians, as full states (m, n)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from typing import Any
 
 import drjit as dr
@@ -99,6 +100,12 @@ class SceneSensor(AbstractDifferentiableSensor):
             sampler, *view = self.camera.rays(pose_of(state), count, step)
             linear, kept = self._render(sampler, view, None)
         return self._observation(linear, kept, view, count, step)
+
+    def numbered(self, first: int) -> SceneSensor:
+        """See :meth:`AbstractSensor.numbered`; the scene is shared."""
+        own, result = self.camera, copy(self)
+        result.camera = SceneCamera(own.sensor, own.mount, own.seed, own.centred, first)
+        return result
 
     def keep(self, observation: Observation) -> Any:
         """Keep what the integrator has to, or else the pixels and its whole state."""

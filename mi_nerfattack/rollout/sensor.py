@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from typing_extensions import Self
+
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.render.posed import PosedField
 
@@ -47,6 +49,14 @@ class AbstractSensor(ABC):
                 as a constant.
             step: index of the control period, from 0; seeds what is random.
         """
+
+    def numbered(self, first: int) -> Self:
+        """Return this sensor with another number of the first drive of each batch.
+
+        What is random depends on a drive's number; by default, nothing is.
+        """
+        del first
+        return self
 
 
 class AbstractDifferentiableSensor(AbstractSensor):

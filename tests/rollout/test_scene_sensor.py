@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ import mi_nerfattack as nf
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import load_field, save_field
 from mi_nerfattack.render.camera.conventions import opencv_to_mitsuba
+from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.render.camera.intrinsics import mount_matrix
 from mi_nerfattack.rollout import (
     KeptBackgrounds,
@@ -26,6 +28,7 @@ from mi_nerfattack.rollout import (
     Rollout,
     SceneSensor,
     StageSum,
+    simulate,
 )
 from mi_nerfattack.vehicle.dynamics import to_state
 
@@ -46,10 +49,16 @@ def folder(tmp_path: Path, variant: str) -> Path:
     return tmp_path
 
 
-def scene(folder: Path, walls: bool = False, **more: Any) -> mi.Scene:
+def scene(
+    folder: Path, walls: bool = False, random: bool = False, **more: Any
+) -> mi.Scene:
     """Load fields in fog, between them a wall that a nested prb shows."""
     nested = {"behind": {"type": "prb", "max_depth": 2}} if walls else {}
     described = walled.scene_dict(folder, walled.PERSPECTIVE, walls, **nested, **more)
+    if random:
+        described["sensor"]["sampler"] = {"type": "independent"}
+        described["integrator"]["jitter"] = True
+        described["sky"] = {"type": "constant"}
     described["integrator"]["id"] = "fields"
     return walled.load(described)
 
@@ -116,6 +125,22 @@ def test_vehicles_are_rendered_together(folder) -> None:
     for image, state in zip(both, BOTH, strict=True):
         alone = sensor.observe(to_state(state[None]), 0).image.numpy()[0]
         np.testing.assert_allclose(image, alone, atol=1e-6)
+
+
+def test_a_drive_is_the_same_in_any_batch(folder) -> None:
+    """Random are places in pixels and along rays, nested paths, and disturbances."""
+    loaded = scene(folder, walls=True, random=True)
+    loop = replace(
+        walled.close_loop(SceneSensor(loaded, toy.MOUNT, seed=5)),
+        disturbance=Disturbance(0.3, 0.6, 0.05, seed=2),
+    )
+    poses = np.array([0.1 * np.cos([k, 2 * k, 3 * k]) for k in range(8)])
+    batch = simulate(loop, loop.initial(poses), 12).states_numpy()
+    for k, pose in enumerate(poses):
+        alone = simulate(loop.numbered(k), loop.initial(pose), 12).states_numpy()
+        np.testing.assert_allclose(alone[0], batch[k], atol=1e-5)
+    other = simulate(loop.numbered(8), loop.initial(poses[0]), 12).states_numpy()
+    assert np.abs(other[0] - batch[0]).max() > 1e-3
 
 
 def direction(colours: np.ndarray) -> np.ndarray:

@@ -30,7 +30,7 @@ _STREAM = 3  # of the seed; initial poses have others
 class Disturbance:
     """Blur and exposure drawn for each drive of a batch, noise for each frame.
 
-    Everything drawn is a function of the seed, the row of the batch and the step:
+    Everything drawn is a function of the seed, the drive's number and the step:
     derivatives see the same numbers, and nothing is kept. Parts of size 0 are left out.
 
     Cost: some launches of kernels over the image's values, and as many to
@@ -42,6 +42,7 @@ class Disturbance:
         noise_sd: standard deviation of the noise, sRGB in [0, 1]; normal, independent
             of pixel, channel and frame.
         seed: of all draws.
+        first: number of the first drive of a batch.
 
     Source: Athalye et al. 2018, expectation over transformation.
     """
@@ -50,6 +51,7 @@ class Disturbance:
     blur_px_sd: NonNegative = 0.0
     noise_sd: NonNegative = 0.0
     seed: Whole = 0
+    first: Whole = 0
 
     def __bool__(self) -> bool:
         """Tell whether it changes anything."""
@@ -57,7 +59,8 @@ class Disturbance:
 
     def draws(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the drives' exposures, powers of two, and blurs, pixels; (count,)."""
-        normal = np.random.default_rng([self.seed, _STREAM]).normal(size=(count, 2))
+        random = np.random.default_rng([self.seed, _STREAM])
+        normal = random.normal(size=(self.first + count, 2))[self.first :]
         return self.exposure_ev_sd * normal[:, 0], self.blur_px_sd * abs(normal[:, 1])
 
     def apply(self, image: Any, step: int) -> Any:
@@ -71,7 +74,8 @@ class Disturbance:
             a tensor like it; differentiable.
         """
         exposures, blurs = self.draws(image.shape[0])
-        return disturbed(image, exposures, blurs, self.noise_sd, self.seed, step)
+        draw = self.noise_sd, self.seed, step, self.first
+        return disturbed(image, exposures, blurs, *draw)
 
     def vjp(self, image: Any, step: int, d_shown: Any) -> Any:
         """Return the derivative by the image from the one by what is shown.
@@ -93,6 +97,7 @@ def disturbed(
     noise_sd: float,
     seed: int,
     step: int,
+    first: int = 0,
 ) -> Any:
     """Blur and expose images, and add noise.
 
@@ -103,6 +108,7 @@ def disturbed(
         noise_sd: standard deviation of the noise, sRGB in [0, 1].
         seed: of the noise.
         step: likewise.
+        first: likewise, number of the first image.
 
     Returns:
         a tensor like it; differentiable.
@@ -116,7 +122,7 @@ def disturbed(
         gain = _uploaded(kind, 2.0**exposures)
         value = dr.linear_to_srgb(value * dr.gather(kind, gain, _drive(value, shape)))
     if noise_sd:
-        noise = standard_normal(kind, shape, seed, step)
+        noise = standard_normal(kind, shape, seed, step, first)
         value = value + dr.opaque(kind, noise_sd) * noise  # the image itself stays
         value = dr.clip(value, 0, 1)
     return type(image)(value, shape)
@@ -175,7 +181,9 @@ def _gaussian(sd: float) -> list[float]:
     return (weights / weights.sum()).tolist()
 
 
-def standard_normal(kind: Any, shape: tuple[int, ...], seed: int, step: int) -> Any:
+def standard_normal(
+    kind: Any, shape: tuple[int, ...], seed: int, step: int, first: int = 0
+) -> Any:
     """Draw normal numbers by counters, a function of seed, row and step.
 
     Args:
@@ -183,12 +191,18 @@ def standard_normal(kind: Any, shape: tuple[int, ...], seed: int, step: int) -> 
         shape: (n, ...), of a row a drive; other n have the same rows.
         seed: of all.
         step: index of the control period.
+        first: number of the first row.
 
     Returns:
         flat values, mean 0 and variance 1.
     """
     (key,) = np.random.SeedSequence([seed, _STREAM, step]).generate_state(1, np.uint64)
-    return dr.rng(seed=int(key)).normal(kind, math.prod(shape))
+    size = math.prod(shape)
+    skipped = first * size // shape[0]
+    drawn = dr.rng(seed=int(key)).normal(kind, skipped + size)
+    if not skipped:
+        return drawn
+    return dr.gather(kind, drawn, dr.arange(dr.uint32_array_t(kind), size) + skipped)
 
 
 def _drive(value: Any, shape: tuple[int, ...]) -> Any:
