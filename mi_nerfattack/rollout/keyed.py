@@ -22,7 +22,8 @@ def keyed_sampler(
     """
     ray = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
     state, stream = mi.sample_tea_32(mi.sample_tea_32(step, seed)[0], ray)
-    random = mi.PCG32()  # with arguments, it would add the index of the ray
+    # with arguments, the constructor would add the index of the ray
+    random = mi.PCG32()  # pyright: ignore[reportCallIssue]
     random.seed(mi.UInt64(state), mi.UInt64(stream))
     return _type(mi.variant())(random)
 
@@ -34,12 +35,12 @@ def _type(variant: str | None) -> Any:
     class KeyedSampler(mi.Sampler):
         """Numbers of `mi.PCG32`, as those of Mitsuba's `independent`."""
 
-        def __init__(self, random: mi.PCG32) -> None:
+        def __init__(self, random: Any) -> None:
             super().__init__(mi.Properties("independent"))
             self.random = random
 
         def clone(self) -> KeyedSampler:
-            return KeyedSampler(mi.PCG32(self.random))
+            return KeyedSampler(mi.PCG32(self.random))  # pyright: ignore
 
         def next_1d(self, active: Any = True) -> mi.Float:
             return self.random.next_float32(mi.Bool(active))
