@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import Any
@@ -237,6 +237,7 @@ class FieldIntegrator(FilmIntegrator):
         active: Mask = True,
         δsplats: Any = None,
         width: int = 0,
+        gains: Sequence[mi.Color3f] = (),
         **kwargs: Any,
     ) -> tuple[Any, mi.Bool, list[mi.Float], Any]:
         """Integrate one ray a lane; see Mitsuba's ``RBIntegrator.sample``.
@@ -244,6 +245,7 @@ class FieldIntegrator(FilmIntegrator):
         Where a film asks for the derivatives of :meth:`splats`, it gives their
         cotangents as ``δsplats``, and finds their tangents in the place of the state.
         ``width`` are the rays in a row of an image, where nothing is being recorded.
+        ``gains`` multiply the radiance of the fields, (3, n) each, besides their light.
         """
         del depth, kwargs
         is_primal = mode == dr.ADMode.Primal
@@ -259,7 +261,7 @@ class FieldIntegrator(FilmIntegrator):
         jitter = sampler.next_1d(active) if self.jitter else mi.Float(0.5)
         # Where the fields end: the first surface that light does not pass straight
         t_max = nearest_surface(scene, ray, active)
-        rays = Rays(ray.o, ray.d, t_max, jitter, active)
+        rays = Rays(ray.o, ray.d, t_max, jitter, active, list(gains))
         # I and a of the fields (A.1 to A.6), and L_b behind them
         if state_in is None:  # primal mode, or forward mode, which comes without
             inner = sampler if is_primal else sampler.clone()

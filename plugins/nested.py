@@ -89,7 +89,9 @@ def look(
     """
     light = integrator.relighting
     if light is not None:
-        rays.gains = light.gains(scene, sampler, integrator.posed, rays)
+        found = light.gains(scene, sampler, integrator.posed, rays)
+        more = rays.gains or [mi.Color3f(1)] * len(found)
+        rays.gains = [a * b for a, b in zip(found, more, strict=True)]
     if width:
         dr.make_opaque(rays)
         seen = integrator.frozen.render(rays, width)

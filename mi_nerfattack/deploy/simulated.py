@@ -81,8 +81,9 @@ class AbstractSimulation(AbstractEnvironment):
         if not (self.blur_px or self.noise_sd):
             return frame
         image = policy_image(frame.image)
-        zero, draw = np.zeros(1), (self.noise_sd, self._seed, self._steps)
-        seen = np.array(disturbed(image, zero, zero + self.blur_px, *draw))[0]
+        exposure, blur = np.zeros((1, 3)), np.full(1, self.blur_px)
+        draw = self.noise_sd, self._seed, self._steps
+        seen = np.array(disturbed(image, exposure, blur, *draw))[0]
         image = np.round(255 * seen).astype(np.uint8)
         return replace(frame, image=image, linear=frame.light)
 

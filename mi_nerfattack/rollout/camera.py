@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any
 
 import drjit as dr
@@ -11,7 +12,7 @@ import mitsuba as mi
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import CameraMount
 from mi_nerfattack.render.camera.lens import mount_pose
-from mi_nerfattack.rollout.keyed import keyed_sampler
+from mi_nerfattack.rollout.variation import Variation
 
 
 class SceneCamera:
@@ -28,6 +29,7 @@ class SceneCamera:
         seed: of all random numbers, renewed each control period.
         centred: let rays go through the middles of n x n squares of a pixel.
         first: number of the first drive of a batch.
+        variation: of the mount from drive to drive.
 
     Raises:
         InputError: `centred`, and a number of samples that is no square.
@@ -40,11 +42,14 @@ class SceneCamera:
         seed: int,
         centred: bool = False,
         first: int = 0,
+        variation: Variation | None = None,
     ) -> None:
         self.sensor: Any = sensor
         self.mount: CameraMount = mount
         self.seed: int = seed
         self.centred, self.first = centred, first
+        self.variation: Variation | None = variation
+        self._mounts: dict[int, tuple[Any, Any]] = {}
         if centred and math.isqrt(self.spp) ** 2 != self.spp:
             raise InputError(
                 f"samples per pixel: {self.spp}; rays through the middles of squares "
@@ -125,6 +130,24 @@ class SceneCamera:
         within, aperture = (dr.gather(mi.Point2f, x, ray) for x in (within, aperture))
         return sampler, within, aperture
 
+    def changed(self, first: int, variation: Variation | None) -> SceneCamera:
+        """Return this camera with other draws."""
+        return SceneCamera(
+            self.sensor, self.mount, self.seed, self.centred, first, variation
+        )
+
+    def light(self, count: int) -> mi.Color3f | None:
+        """Return factors of the light on objects, (3, n), ray by ray; None for 1."""
+        if self.variation is None or not self.variation.of_light:
+            return None
+        drawn = self.variation.draws(self.first, count).light
+        light = mi.Color3f(*(mi.Float(channel.tolist()) for channel in drawn))
+        dr.make_opaque(light)
+        width, height = self.size
+        rays = width * height * self.spp
+        index = dr.arange(mi.UInt32, count * rays) // rays
+        return dr.gather(mi.Color3f, light, index)
+
     def eye(self, pose: Any, count: int) -> mi.Point3f:
         """Return where the eye of each ray of :meth:`rays` is, (3, n)."""
         origin, _ = self._place(pose)
@@ -138,11 +161,27 @@ class SceneCamera:
 
     def _place(self, pose: Any) -> tuple[mi.Point3f, Any]:
         """Return the cameras' positions, and the columns of their rotations."""
-        mount = self.mount
         state = mi.Float(pose[0]), mi.Float(pose[1]), mi.Float(pose[2])
-        found = mount_pose(state, mount.height_m, mount.forward_m, mount.pitch_deg)
+        height, pitch = self._mount(dr.width(pose))
+        found = mount_pose(state, height, self.mount.forward_m, pitch)
         dr.eval(found)
         return found
+
+    def _mount(self, count: int) -> tuple[Any, Any]:
+        """Return heights, metres, and pitches, degrees: one for all, or of each."""
+        mount = self.mount
+        if self.variation is None or not self.variation.of_mount:
+            return mount.height_m, mount.pitch_deg
+        if count not in self._mounts:
+            drawn = self.variation.draws(self.first, count)
+            height, pitch = mount.height_m * drawn.height, drawn.pitch_deg
+            found = (
+                mi.Float(height.tolist()),
+                mi.Float((mount.pitch_deg + pitch).tolist()),
+            )
+            dr.make_opaque(found)
+            self._mounts[count] = found
+        return self._mounts[count]
 
     def _centres(self, total: int) -> mi.Point2f:
         """Return the middles of the squares of pixels, (2, total)."""
@@ -170,3 +209,52 @@ class SceneCamera:
             index = dr.arange(mi.UInt32, dr.width(d_linear) * spp) // spp
             d_linear = dr.gather(mi.Color3f, d_linear, index) / spp
         return mi.Spectrum(d_linear)
+
+
+def keyed_sampler(
+    seed: mi.UInt32, step: mi.UInt32, first: int, count: int
+) -> mi.Sampler:
+    """Make a sampler of independent numbers for an integrator.
+
+    Args:
+        seed: of all.
+        step: index of the control period.
+        first: number of the first ray among those of all drives.
+        count: of rays.
+    """
+    ray = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
+    state, stream = mi.sample_tea_32(mi.sample_tea_32(step, seed)[0], ray)
+    # with arguments, the constructor would add the index of the ray
+    random = mi.PCG32()  # pyright: ignore[reportCallIssue]
+    random.seed(mi.UInt64(state), mi.UInt64(stream))
+    return _type(mi.variant())(random)
+
+
+@cache
+def _type(variant: str | None) -> Any:
+    del variant  # Mitsuba's class follows from it
+
+    class KeyedSampler(mi.Sampler):
+        """Numbers of `mi.PCG32`, as those of Mitsuba's `independent`."""
+
+        def __init__(self, random: Any) -> None:
+            super().__init__(mi.Properties("independent"))
+            self.random = random
+
+        def clone(self) -> KeyedSampler:
+            return KeyedSampler(mi.PCG32(self.random))  # pyright: ignore
+
+        def next_1d(self, active: Any = True) -> mi.Float:
+            return self.random.next_float32(mi.Bool(active))
+
+        def next_2d(self, active: Any = True) -> mi.Point2f:
+            x = self.next_1d(active)
+            return mi.Point2f(x, self.next_1d(active))
+
+        def schedule_state(self) -> None:
+            dr.schedule(self.random)
+
+        def wavefront_size(self) -> int:
+            return dr.width(self.random)
+
+    return KeyedSampler

@@ -78,9 +78,12 @@ class ClosedLoop:
 
         A drive alone with the number of its row is the same as in the batch.
         """
-        disturbance = replace(self.disturbance, first=first)
-        sensor = self.sensor.numbered(first)
-        return replace(self, sensor=sensor, disturbance=disturbance)
+        return replace(
+            self,
+            sensor=self.sensor.numbered(first),
+            dynamics=self.dynamics.numbered(first),
+            disturbance=replace(self.disturbance, first=first),
+        )
 
     def initial(self, poses: np.ndarray) -> Any:
         """Upload initial poses (n, 3), metres and radians, as full states (m, n)."""

@@ -19,6 +19,7 @@ from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.rollout.camera import SceneCamera
 from mi_nerfattack.rollout.parameters import CollectsRays, Differentiated
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor, Observation
+from mi_nerfattack.rollout.variation import Variation
 
 
 class SceneSensor(AbstractDifferentiableSensor):
@@ -103,8 +104,24 @@ class SceneSensor(AbstractDifferentiableSensor):
 
     def numbered(self, first: int) -> SceneSensor:
         """See :meth:`AbstractSensor.numbered`; the scene is shared."""
-        own, result = self.camera, copy(self)
-        result.camera = SceneCamera(own.sensor, own.mount, own.seed, own.centred, first)
+        return self._with(self.camera.changed(first, self.camera.variation))
+
+    def varied(self, variation: Variation) -> SceneSensor:
+        """Return this sensor with another light and mount in each drive of a batch.
+
+        Raises:
+            InputError: light on objects, and no `field_integrator` that shows them.
+        """
+        if variation.of_light and self._collector is None:
+            raise InputError(
+                f"light: {type(self.integrator).__name__} shows no objects whose light "
+                "could vary; show them by a field_integrator"
+            )
+        return self._with(self.camera.changed(self.camera.first, variation))
+
+    def _with(self, camera: SceneCamera) -> SceneSensor:
+        result = copy(self)
+        result.camera = camera
         return result
 
     def keep(self, observation: Observation) -> Any:
@@ -163,7 +180,8 @@ class SceneSensor(AbstractDifferentiableSensor):
         """Return linear pixels, and the integrator's state."""
         ray, weight = view
         mode = dr.ADMode.Primal
-        colour, _, _, kept = self._sample(mode, sampler, ray, None, state_in)
+        gains = [] if state_in is not None else self._gains(dr.width(ray.o))
+        colour, _, _, kept = self._sample(mode, sampler, ray, None, state_in, gains)
         linear = self.camera.pixels(colour * weight)
         dr.eval(linear, kept)
         return linear, kept
@@ -175,7 +193,9 @@ class SceneSensor(AbstractDifferentiableSensor):
         ray: mi.Ray3f,
         δL: Any = None,
         state_in: Any = None,
+        gains: Sequence[mi.Color3f] = (),
     ) -> tuple[Any, ...]:
+        more = {"gains": gains} if gains else {}
         return self.integrator.sample(
             mode=mode,
             scene=self.scene,
@@ -187,7 +207,17 @@ class SceneSensor(AbstractDifferentiableSensor):
             state_in=state_in,
             active=mi.Bool(True),
             width=self.camera.size[0] * self.camera.spp,
+            **more,
         )
+
+    def _gains(self, rays: int) -> list[mi.Color3f]:
+        """Return the variation's factors of all layers, (3, n) each; none for 1."""
+        width, height = self.camera.size
+        light = self.camera.light(rays // (width * height * self.camera.spp))
+        if light is None:
+            return []
+        own = [id(posed) for posed in self.objects]
+        return [light if id(x) in own else mi.Color3f(1) for x in self.layers]
 
     def _observation(
         self, linear: mi.Color3f, kept: Any, view: Any, count: int, step: int

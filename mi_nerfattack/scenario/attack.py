@@ -33,7 +33,6 @@ from mi_nerfattack.ranges import (
     SomeShare,
     Whole,
 )
-from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.rollout.adjoint import (
     Checkpointed,
     KeptBackgrounds,
@@ -42,6 +41,7 @@ from mi_nerfattack.rollout.adjoint import (
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.scenario.named_file import File
 from mi_nerfattack.scenario.section import Kinds, Section, refuse
+from mi_nerfattack.scenario.vary import VarySection
 from mi_nerfattack.vehicle.route.route import Route
 
 Population = Annotated[int, Field(ge=2)]
@@ -362,13 +362,6 @@ class AttackSection(Section):
     )
     attached: bool = False
     jitter: bool = False
-    exposure_ev_sd: NonNegative = 0.0  # of the poses' drives, powers of two
-    blur_px_sd: NonNegative = 0.0  # of the number whose size blurs a drive
-    noise_sd: NonNegative = 0.0  # of each frame, sRGB in [0, 1]
+    vary: VarySection = VarySection()  # between the poses' drives
     checkpoint_every: Count = 10
     deterministic: bool = False  # equal bits from run to run, on one thread
-
-    def disturbance(self, seed: int) -> Disturbance:
-        """Make what the attack's images go through."""
-        sizes = self.exposure_ev_sd, self.blur_px_sd, self.noise_sd
-        return Disturbance(*sizes, seed)

@@ -34,7 +34,8 @@ _MOVES: dict[str, dict[str, str]] = {
     | _to("method", "variant coefficients spread population")
     | _to("freedom", "learning_rate resolution smoothing linf l2 lowest highest gamut")
     | _to("freedom", "fixed_m total_variation pose_learning_rate pose_axes")
-    | _to("freedom", "pose_limit_m pose_limit_deg"),
+    | _to("freedom", "pose_limit_m pose_limit_deg")
+    | _to("vary", "exposure_ev_sd blur_px_sd noise_sd"),
     "policy": {"goal": "goal.kind", "goals": "goal.count"},
     "vehicle": {"model": "kind"},
     "deployment": {"environment": "kind"},

@@ -36,6 +36,7 @@ from mi_nerfattack.rollout.sensor import AbstractSensor
 from mi_nerfattack.scenario.attack import Task
 from mi_nerfattack.scenario.deployment import SURROGATE, Deployment, deployments
 from mi_nerfattack.scenario.scenario import Scenario, SceneSection
+from mi_nerfattack.scenario.vary import VarySection
 from mi_nerfattack.vehicle.route.route import Route
 
 
@@ -301,8 +302,9 @@ def build_rollout(world: World) -> tuple[Rollout, Any]:
         the drives, and the initial states (m, n) that they start from.
     """
     scenario, section = world.scenario, world.scenario.attack
-    disturbance = section.disturbance(scenario.seed)
-    loop = replace(world.loop(world.optimised), disturbance=disturbance)
+    loop = world.loop(world.optimised)
+    if section.vary != VarySection():
+        loop = section.vary.applied(loop, scenario.seed)
     rollout = Rollout(
         loop,
         world.objective,

@@ -138,6 +138,19 @@ class AbstractDynamics(ABC):
     def saturate(self, control: Any) -> Any:
         """Limit a commanded control (n,) smoothly to what the vehicle can do."""
 
+    def numbered(self, first: int) -> AbstractDynamics:
+        """Return this model with another number of the first drive of each batch.
+
+        By default all drives have the same vehicle.
+        """
+        del first
+        return self
+
+    def constants(self, state: Any) -> list[Any]:
+        """Return the arrays that :meth:`derivative` reads beside a state (m, n)."""
+        del state
+        return []
+
     def check(self, state: Any) -> None:
         """Raise `InputError` where a state (m, n) shows that the model has failed.
 

@@ -235,7 +235,7 @@ class Transition:
         self.late: int = delay % substeps
         calls = (self._advance, self._vjp)
         if dynamics.recordable:
-            calls = tuple(freeze_method(call, self._sizes) for call in calls)
+            calls = tuple(freeze_method(call, self._beside) for call in calls)
         self._advance_call, self._vjp_call = calls
 
     def sources(self, period: int) -> tuple[int, int]:
@@ -289,6 +289,7 @@ class Transition:
     def _vjp(self, state: Any, older: Any, newer: Any, cotangent: Any) -> tuple:
         return vjp(lambda x: self._advance(*x)[-1], (state, older, newer), cotangent)
 
-    def _sizes(self, *arguments: Any) -> list[int]:
-        """Return what a recording depends on beside the arguments: their sizes."""
-        return [dr.width(x) for x in arguments]
+    def _beside(self, state: Any, *more: Any) -> list[Any]:
+        """Return what a recording depends on beside the arguments, their sizes too."""
+        sizes = [dr.width(x) for x in (state, *more)]
+        return [sizes, self.dynamics.constants(state)]

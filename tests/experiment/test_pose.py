@@ -111,7 +111,8 @@ def test_the_seed_decides_all_that_is_drawn(folder):
     with deterministic():
         for seed in (4, 4, 5):
             attack, world = attack_of(folder, seed)
-            assert attack.rollout.loop.disturbance == Disturbance(0.5, 0.8, 0.02, seed)
+            loop = attack.rollout.loop
+            assert loop.disturbance == Disturbance(0.5, 0.8, 0.02, 0.1, seed)
             assert world.surrogate.camera.seed == seed
             attack.step()
             found.append([attack.tensors()["value.0"], np.array(attack.initial)])

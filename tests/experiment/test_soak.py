@@ -42,7 +42,7 @@ CHANGES = {
     "[camera]\nwidth = 32\nheight = 16\n[drive]",
     "learning_rate = 0.5": 'kind = "both"\nfreedom.learning_rate = 0.0005\n'
     "freedom.pose_learning_rate = 0.0005\nmethod.final_rate = 1.0\n"
-    "jitter = true\nnoise_sd = 0.02",
+    "jitter = true\nvary.noise_sd = 0.02",
     "checkpoint_every = 3": f"checkpoint_every = {EVERY}",
 }
 #: Of an iteration, bytes: its record in the history, and room for a copy at a

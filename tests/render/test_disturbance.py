@@ -19,8 +19,10 @@ from mi_nerfattack.render.camera.disturbance import Disturbance, blur, standard_
 pytestmark = pytest.mark.usefixtures("variant")
 
 SHAPE = (3, 5, 9, 3)
-ALL = Disturbance(exposure_ev_sd=0.9, blur_px_sd=0.6, noise_sd=0.04, seed=7)
-SIZES = ("exposure_ev_sd", "blur_px_sd", "noise_sd")
+ALL = Disturbance(
+    exposure_ev_sd=0.9, blur_px_sd=0.6, noise_sd=0.04, colour_ev_sd=0.3, seed=7
+)
+SIZES = ("exposure_ev_sd", "blur_px_sd", "noise_sd", "colour_ev_sd")
 
 
 @pytest.fixture
@@ -47,7 +49,7 @@ def test_blur_is_that_of_scipy(image, largest):
 def test_light_is_blurred_and_exposed_and_values_get_noise(image):
     exposures, blurs = ALL.draws(3)
     light = blurred(srgb_to_linear_numpy(image), blurs)
-    value = linear_to_srgb_numpy(light * 2.0 ** exposures[:, None, None, None])
+    value = linear_to_srgb_numpy(light * 2.0 ** exposures[:, None, None])
     noise = np.array(standard_normal(row_type(), SHAPE, 7, 2)).reshape(SHAPE)
     expected = np.clip(value + 0.04 * noise, 0, 1)
     given = tensor(image)
@@ -59,10 +61,12 @@ def test_light_is_blurred_and_exposed_and_values_get_noise(image):
 
 def test_exposures_and_blurs_are_normal_and_half_normal():
     exposures, blurs = ALL.draws(20000)
-    assert exposures.std() == pytest.approx(0.9, rel=0.03)
+    assert exposures.std(0) == pytest.approx(np.hypot(0.9, 0.3), rel=0.03)
+    # what the channels share is the exposure
+    assert np.cov(exposures.T)[0, 1] == pytest.approx(0.81, rel=0.04)
     assert abs(exposures.mean()) < 0.025 and blurs.min() >= 0
     assert np.sqrt((blurs**2).mean()) == pytest.approx(0.6, rel=0.03)
-    assert abs(np.corrcoef(exposures, blurs)[0, 1]) < 0.03
+    assert abs(np.corrcoef(exposures[:, 0], blurs)[0, 1]) < 0.03
     for few, many in zip(ALL.draws(2), ALL.draws(5), strict=True):
         assert np.array_equal(few, many[:2])  # a drive's own, whatever the batch
 

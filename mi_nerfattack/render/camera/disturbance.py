@@ -41,6 +41,7 @@ class Disturbance:
         blur_px_sd: of the normal number whose size is the blur's standard deviation.
         noise_sd: standard deviation of the noise, sRGB in [0, 1]; normal, independent
             of pixel, channel and frame.
+        colour_ev_sd: as of the exposure, of each channel by itself: white balance.
         seed: of all draws.
         first: number of the first drive of a batch.
 
@@ -50,18 +51,23 @@ class Disturbance:
     exposure_ev_sd: NonNegative = 0.0
     blur_px_sd: NonNegative = 0.0
     noise_sd: NonNegative = 0.0
+    colour_ev_sd: NonNegative = 0.0
     seed: Whole = 0
     first: Whole = 0
 
     def __bool__(self) -> bool:
         """Tell whether it changes anything."""
-        return any((self.exposure_ev_sd, self.blur_px_sd, self.noise_sd))
+        sizes = self.exposure_ev_sd, self.blur_px_sd, self.noise_sd, self.colour_ev_sd
+        return any(sizes)
 
     def draws(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the drives' exposures, powers of two, and blurs, pixels; (count,)."""
+        """Return exposures (count, 3), powers of two, and blurs (count,), pixels."""
         random = np.random.default_rng([self.seed, _STREAM])
         normal = random.normal(size=(self.first + count, 2))[self.first :]
-        return self.exposure_ev_sd * normal[:, 0], self.blur_px_sd * abs(normal[:, 1])
+        colours = np.random.default_rng([self.seed, _STREAM, 1])
+        colours = colours.normal(size=(self.first + count, 3))[self.first :]
+        exposures = self.exposure_ev_sd * normal[:, :1] + self.colour_ev_sd * colours
+        return exposures, self.blur_px_sd * abs(normal[:, 1])
 
     def apply(self, image: Any, step: int) -> Any:
         """Disturb the images of a batch.
@@ -103,7 +109,7 @@ def disturbed(
 
     Args:
         image: tensor (n, height, width, 3), sRGB in [0, 1].
-        exposures: (n,), powers of two.
+        exposures: (n, 3) of the channels, powers of two.
         blurs: (n,), standard deviations, pixels.
         noise_sd: standard deviation of the noise, sRGB in [0, 1].
         seed: of the noise.
@@ -119,8 +125,9 @@ def disturbed(
         value = dr.srgb_to_linear(value)
         if blurs.any():
             value = blur(value, shape, blurs)
-        gain = _uploaded(kind, 2.0**exposures)
-        value = dr.linear_to_srgb(value * dr.gather(kind, gain, _drive(value, shape)))
+        gain = _uploaded(kind, (2.0**exposures).ravel())
+        index = _drive_and_channel(value, shape)
+        value = dr.linear_to_srgb(value * dr.gather(kind, gain, index))
     if noise_sd:
         noise = standard_normal(kind, shape, seed, step, first)
         value = value + dr.opaque(kind, noise_sd) * noise  # the image itself stays
@@ -205,10 +212,10 @@ def standard_normal(
     return dr.gather(kind, drawn, dr.arange(dr.uint32_array_t(kind), size) + skipped)
 
 
-def _drive(value: Any, shape: tuple[int, ...]) -> Any:
-    """Return the row of the batch that each flat value belongs to."""
+def _drive_and_channel(value: Any, shape: tuple[int, ...]) -> Any:
+    """Return the index of each flat value among the channels of all drives."""
     index = dr.arange(dr.uint32_array_t(type(value)), dr.width(value))
-    return index // int(np.prod(shape[1:]))
+    return 3 * (index // int(np.prod(shape[1:]))) + index % 3
 
 
 def _uploaded(kind: Any, values: np.ndarray) -> Any:

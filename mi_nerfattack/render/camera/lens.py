@@ -85,26 +85,33 @@ def lens_rays(
 
 
 def mount_pose(
-    state: tuple[Any, Any, Any], height_m: float, forward_m: float, pitch_deg: float
+    state: tuple[Any, Any, Any], height_m: Any, forward_m: float, pitch_deg: Any
 ) -> tuple[Any, tuple[Any, Any, Any]]:
     """Place a mounted camera in the world; differentiable in the state.
 
     Args:
         state: px, py (metres), theta (radians), each a `mi.Float` with one entry per
             vehicle.
-        height_m: as in `CameraMount`; it and the next two reach the kernel as opaque
-            values, so that another mount needs no other kernel.
+        height_m: as in `CameraMount`, or a `mi.Float` with one entry per vehicle; it
+            and the next two reach the kernel as opaque values, so that another mount
+            needs no other kernel.
         forward_m: as in `CameraMount`.
-        pitch_deg: as in `CameraMount`.
+        pitch_deg: like the height.
 
     Returns:
         origin (`mi.Point3f`) and the columns (right, down, forward) of the rotation
         (`mi.Vector3f`, unit length), one entry per vehicle.
     """
     px, py, theta = (mi.Float(value) for value in state)
-    height = dr.opaque(mi.Float, height_m)
-    ahead = dr.opaque(mi.Float, forward_m)
-    sin_pitch, cos_pitch = dr.sincos(dr.opaque(mi.Float, math.radians(pitch_deg)))
+    if isinstance(pitch_deg, mi.Float):
+        pitch = pitch_deg * (math.pi / 180)
+    else:
+        pitch = dr.opaque(mi.Float, math.radians(pitch_deg))
+    height, ahead = (
+        value if isinstance(value, mi.Float) else dr.opaque(mi.Float, value)
+        for value in (height_m, forward_m)
+    )
+    sin_pitch, cos_pitch = dr.sincos(pitch)
     sin_theta, cos_theta = dr.sincos(theta)
     origin = mi.Point3f(px + ahead * cos_theta, py + ahead * sin_theta, height)
     right = mi.Vector3f(sin_theta, -cos_theta, 0)

@@ -27,9 +27,16 @@ from mi_nerfattack.render.camera.pose import Pose
 ROBUST = """
 poses = 3
 jitter = true
-exposure_ev_sd = 0.5
-blur_px_sd = 0.8
-noise_sd = 0.02
+vary.light_ev_sd = 0.4
+vary.light_colour_ev_sd = 0.2
+vary.exposure_ev_sd = 0.5
+vary.colour_ev_sd = 0.1
+vary.blur_px_sd = 0.8
+vary.noise_sd = 0.02
+vary.pitch_deg_sd = 1.0
+vary.height_sd = 0.1
+vary.speed_sd = 0.1
+vary.steering_sd = 0.1
 """
 
 

@@ -1,0 +1,155 @@
+"""What differs from drive to drive of an attack: light, camera and vehicle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_nerfattack.ranges import NonNegative, Whole, checked
+from mi_nerfattack.vehicle.dynamics import AbstractDynamics, Dubins
+
+_STREAM = 4  # of the seed; disturbances and initial poses have others
+
+
+@dataclass(frozen=True)
+@checked("Variation")
+class Variation:
+    """Draw light on the objects, the camera's mount and the vehicle for each drive.
+
+    Everything drawn is a function of the seed and the drive's number. Factors are
+    powers of two or of e, so that none is negative. A light changes the objects alone:
+    with the exposure of a `Disturbance`, this is any ratio of object and background.
+
+    Args:
+        light_ev_sd: standard deviation of the light on objects, powers of two.
+        light_colour_ev_sd: of each channel of it, powers of two.
+        pitch_deg_sd: of the camera's pitch, degrees.
+        height_sd: of the logarithm of the camera's height.
+        speed_sd: of the logarithm of the vehicle's speed.
+        steering_sd: of the logarithm of its answer to the steering, which stands for
+            a wrong wheelbase and for understeer.
+        seed: of all draws.
+
+    Source: Athalye et al. 2018, expectation over transformation.
+    """
+
+    light_ev_sd: NonNegative = 0.0
+    light_colour_ev_sd: NonNegative = 0.0
+    pitch_deg_sd: NonNegative = 0.0
+    height_sd: NonNegative = 0.0
+    speed_sd: NonNegative = 0.0
+    steering_sd: NonNegative = 0.0
+    seed: Whole = 0
+
+    @property
+    def of_light(self) -> bool:
+        """Whether the light on objects differs."""
+        return bool(self.light_ev_sd or self.light_colour_ev_sd)
+
+    @property
+    def of_mount(self) -> bool:
+        """Whether the camera's mount differs."""
+        return bool(self.pitch_deg_sd or self.height_sd)
+
+    @property
+    def of_vehicle(self) -> bool:
+        """Whether the vehicle differs."""
+        return bool(self.speed_sd or self.steering_sd)
+
+    def draws(self, first: int, count: int) -> Draws:
+        """Draw for `count` drives, of which the first has the number `first`."""
+        random = np.random.default_rng([self.seed, _STREAM])
+        normal = random.normal(size=(first + count, 8))[first:].T
+        light = self.light_ev_sd * normal[0] + self.light_colour_ev_sd * normal[1:4]
+        return Draws(
+            2.0**light,
+            self.pitch_deg_sd * normal[4],
+            np.exp(self.height_sd * normal[5]),
+            np.exp(self.speed_sd * normal[6]),
+            np.exp(self.steering_sd * normal[7]),
+        )
+
+
+@dataclass(frozen=True)
+class Draws:
+    """What a `Variation` drew for n drives.
+
+    Attributes:
+        light: (3, n), factors of the objects' linear RGB.
+        pitch_deg: (n,), added to the camera's pitch, degrees.
+        height: (n,), factors of the camera's height.
+        speed: (n,), factors of the vehicle's speed.
+        steering: (n,), factors of its heading rate.
+    """
+
+    light: np.ndarray
+    pitch_deg: np.ndarray
+    height: np.ndarray
+    speed: np.ndarray
+    steering: np.ndarray
+
+
+@dataclass(frozen=True)
+class Varied(AbstractDynamics):
+    """A vehicle whose speed and answer to the steering differ from drive to drive.
+
+    The heading rate of all models but `Dubins` is proportional to the speed.
+
+    Args:
+        model: the vehicle.
+        variation: of it.
+        first: number of the first drive of a batch.
+    """
+
+    model: AbstractDynamics
+    variation: Variation
+    first: int = 0
+    _factors: Any = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "recordable", self.model.recordable)
+        object.__setattr__(self, "_factors", cache(self._uploaded))
+
+    @property
+    def state_size(self) -> int:
+        """See :class:`AbstractDynamics`."""
+        return self.model.state_size
+
+    def numbered(self, first: int) -> Varied:
+        """See :meth:`AbstractDynamics.numbered`."""
+        return replace(self, first=first)
+
+    def extend(self, poses: np.ndarray) -> np.ndarray:
+        """See :meth:`AbstractDynamics.extend`."""
+        return self.model.extend(poses)
+
+    def derivative(self, state: Any, control: Any) -> Any:
+        """See :meth:`AbstractDynamics.derivative`."""
+        speed, steering = self.constants(state)
+        slope = self.model.derivative(state, control)
+        if not isinstance(self.model, Dubins):
+            steering = steering * speed
+        moved = speed * slope[0], speed * slope[1], steering * slope[2]
+        return type(state)(*moved, *(slope[i] for i in range(3, len(slope))))
+
+    def saturate(self, control: Any) -> Any:
+        """See :meth:`AbstractDynamics.saturate`."""
+        return self.model.saturate(control)
+
+    def check(self, state: Any) -> None:
+        """See :meth:`AbstractDynamics.check`."""
+        self.model.check(state)
+
+    def constants(self, state: Any) -> list[Any]:
+        """See :meth:`AbstractDynamics.constants`."""
+        return self._factors(dr.detached_t(type(state[0])), dr.width(state))
+
+    def _uploaded(self, kind: Any, count: int) -> list[Any]:
+        drawn = self.variation.draws(self.first, count)
+        result = [kind(drawn.speed.tolist()), kind(drawn.steering.tolist())]
+        dr.make_opaque(result)
+        return result

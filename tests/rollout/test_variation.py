@@ -1,0 +1,154 @@
+"""Light, camera and vehicle that differ from drive to drive."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+from support.worlds import loops as toy
+
+from mi_nerfattack.deploy.surrogate.environment import take_apart
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.rollout.loop import ClosedLoop, simulate
+from mi_nerfattack.rollout.scene_sensor import SceneSensor
+from mi_nerfattack.rollout.variation import Variation, Varied
+from mi_nerfattack.vehicle.bicycle import RateLimitedAckermann
+from mi_nerfattack.vehicle.dynamics import Ackermann, Dubins
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+ALL = Variation(0.5, 0.4, 3.0, 0.2, 0.15, 0.25, seed=4)
+POSES = np.array([[0.0, 0.35, 0.02], [0.3, 0.2, -0.04], [-0.2, -0.1, 0.08]])
+
+
+def varied(variation: Variation = ALL) -> tuple[ClosedLoop, SceneSensor]:
+    """Return a loop whose drives differ, and its sensor as it was."""
+    loop, _ = toy.make_loop()
+    plain = loop.sensor
+    assert isinstance(plain, SceneSensor)
+    dynamics = Varied(loop.dynamics, variation)
+    return replace(loop, sensor=plain.varied(variation), dynamics=dynamics), plain
+
+
+def test_draws_have_the_given_deviations_and_belong_to_a_drive():
+    drawn = ALL.draws(0, 40000)
+    light = np.log2(drawn.light)
+    assert light.std(1) == pytest.approx(np.hypot(0.5, 0.4), rel=0.03)
+    # what the channels share is the light's brightness
+    shared = np.cov(light)[0, 1]
+    assert shared == pytest.approx(0.25, rel=0.05)
+    factors = np.log([drawn.height, drawn.speed, drawn.steering])
+    assert factors.std(1) == pytest.approx([0.2, 0.15, 0.25], rel=0.03)
+    assert drawn.pitch_deg.std() == pytest.approx(3, rel=0.03)
+    assert (
+        abs(np.corrcoef(np.vstack([factors, drawn.pitch_deg])) - np.eye(4)).max() < 0.03
+    )
+    later = ALL.draws(2, 3)
+    assert np.array_equal(later.light, drawn.light[:, 2:5])
+    assert np.array_equal(later.speed, drawn.speed[2:5])
+
+
+def test_light_multiplies_what_an_object_gives():
+    variation = Variation(0.8, 0.5, seed=1)
+    loop, plain = varied(variation)
+    state = loop.initial(POSES)
+    before, after = plain.observe(state, 0), loop.sensor.observe(state, 0)
+    shown = take_apart(plain, before, dr.zeros(type(before.linear.x), 1))
+    object_alone = shown.objects[0].radiance.numpy()
+    gain = np.repeat(variation.draws(0, 3).light, toy.WIDTH * toy.HEIGHT, axis=1)
+    expected = before.linear.numpy() + (gain - 1) * object_alone
+    assert abs(expected - before.linear.numpy()).max() > 0.05
+    np.testing.assert_allclose(after.linear.numpy(), expected, atol=2e-6)
+
+
+def test_each_drive_has_its_own_mount():
+    loop, plain = varied(Variation(pitch_deg_sd=3.0, height_sd=0.2, seed=2))
+    images = loop.sensor.observe(loop.initial(POSES), 0).image.numpy()
+    drawn = Variation(pitch_deg_sd=3.0, height_sd=0.2, seed=2).draws(0, 3)
+    for k, pose in enumerate(POSES):
+        mount = replace(
+            toy.MOUNT,
+            height_m=toy.MOUNT.height_m * drawn.height[k],
+            pitch_deg=toy.MOUNT.pitch_deg + drawn.pitch_deg[k],
+        )
+        camera = plain.camera
+        other = SceneSensor(
+            plain.scene, mount, sensor=camera.sensor, centred=camera.centred
+        )
+        alone = other.observe(loop.initial(pose), 0).image.numpy()[0]
+        np.testing.assert_allclose(images[k], alone, atol=1e-5)
+    assert (
+        abs(images[0] - plain.observe(loop.initial(POSES), 0).image.numpy()[0]).max()
+        > 0.01
+    )
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        Dubins(5, 1.5),
+        Ackermann(5, 2.7, 0.6),
+        RateLimitedAckermann(5, 2.7, 0.6, 0.7, 0.1),
+    ],
+)
+def test_each_drive_has_its_own_vehicle(model):
+    """That of another speed and, where the model has one, another wheelbase."""
+    variation = Variation(speed_sd=0.2, steering_sd=0.3, seed=3)
+    drawn = variation.draws(0, 3)
+    rows = model.state_size
+    state = Varied(model, variation)
+    loop, _ = toy.make_loop()
+    start = replace(loop, dynamics=model).initial(POSES)
+    control = type(start[0])([0.3, -0.2, 0.1])
+    found = np.array(state.derivative(start, control))
+    for k in range(3):
+        own = {"speed": model.speed * drawn.speed[k]}
+        if rows > 3 or isinstance(model, Ackermann):
+            own["wheelbase"] = model.wheelbase / drawn.steering[k]
+        expected = np.array(replace(model, **own).derivative(start, control))[:, k]
+        if isinstance(model, Dubins):
+            expected[2] *= drawn.steering[k]
+        np.testing.assert_allclose(found[:, k], expected, rtol=1e-12)
+
+
+def test_a_varied_drive_is_the_same_in_any_batch_and_from_run_to_run():
+    loop, plain = varied()
+    batch = simulate(loop, loop.initial(POSES), 8).states_numpy()
+    assert np.array_equal(simulate(loop, loop.initial(POSES), 8).states_numpy(), batch)
+    for k, pose in enumerate(POSES):
+        alone = simulate(loop.numbered(k), loop.initial(pose), 8).states_numpy()
+        np.testing.assert_allclose(alone[0], batch[k], atol=1e-5)
+    nominal = replace(loop, sensor=plain, dynamics=loop.dynamics.model)
+    other = simulate(nominal, loop.initial(POSES), 8).states_numpy()
+    assert abs(other - batch).max() > 0.05
+
+
+@pytest.mark.parametrize("adjoint", toy.ADJOINTS)
+def test_gradients_are_those_of_the_varied_drives(adjoint):
+    """Attached, so that light, mount and vehicle are all in the derivative."""
+    loop, _ = varied()
+    loop = replace(loop, eight_bit=False)
+    rollout = toy.make_rollout(loop, 6, attached=True, adjoint=adjoint)
+    initial = loop.initial(POSES)
+    field = loop.sensor.fields[0]
+    before = toy.texture_of(field)
+    along = np.random.default_rng(0).normal(size=before.shape).astype(np.float32)
+
+    def value(step: float) -> float:
+        loop.sensor.set_textures([before + step * along])
+        return rollout.measure(initial).value
+
+    difference = (value(1e-2) - value(-1e-2)) / 2e-2
+    loop.sensor.set_textures([before])
+    found = rollout.gradient(rollout.run(initial)).textures[0].numpy()
+    assert (found * along).sum() == pytest.approx(difference, rel=0.02)
+
+
+def test_light_without_objects_to_shine_on_is_refused():
+    loop, plain = varied()
+    plain._collector = None
+    with pytest.raises(InputError, match="field_integrator"):
+        plain.varied(ALL)
+    assert plain.varied(Variation(speed_sd=0.1)).camera is not plain.camera
