@@ -61,6 +61,8 @@ Row = tuple[Finite, Finite, Finite, Finite]
 
 #: Of `[scene]`, what only drives in the surrogate depend on.
 SURROGATE_KEYS = ("field", "composite", "spp", "step_m", "stop", "to_world")
+#: Rays per pixel with which the objective is smooth: docs/loop.md.
+SMOOTH_SPP = 9
 _LONGEST = 1_000_000  # control periods of a drive
 Periods = Annotated[int, Field(ge=1, lt=_LONGEST)]
 
@@ -75,7 +77,7 @@ class SceneSection(Section):
     routes: File  # JSON of routes
     route: str  # name of the route that is driven
     composite: Literal["depth", "interleaved"] = "depth"  # of fields, in the surrogate
-    spp: Literal[1, 4, 9, 16] = 1  # rays per pixel in the surrogate
+    spp: Literal[1, 4, 9, 16] = SMOOTH_SPP  # rays per pixel in the surrogate
     step_m: Positive | None = None  # of the march near the camera; the field's own
     stop: Fraction = STOP  # transmittance at which rays end in the surrogate
     to_world: tuple[Row, Row, Row, Row] | None = None  # of the field: uniform scale

@@ -35,7 +35,7 @@ from mi_nerfattack.rollout.scene_sensor import SceneSensor
 from mi_nerfattack.rollout.sensor import AbstractSensor
 from mi_nerfattack.scenario.attack import Task
 from mi_nerfattack.scenario.deployment import SURROGATE, Deployment, deployments
-from mi_nerfattack.scenario.scenario import Scenario, SceneSection
+from mi_nerfattack.scenario.scenario import SMOOTH_SPP, Scenario, SceneSection
 from mi_nerfattack.scenario.vary import VarySection
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -276,6 +276,7 @@ def build_surrogate(scenario: Scenario) -> SceneSensor:
         if scenario.attack.attached:
             try:
                 sensor.check_attached()
+                _require_smooth(sensor, "sample_count of its sensor")
             except InputError as err:
                 raise InputError(f"{place.surrogate}: {err}") from err
         return sensor
@@ -289,17 +290,24 @@ def build_surrogate(scenario: Scenario) -> SceneSensor:
     look = jitter, place.stop, place.composite, names
     assert place.field is not None  # checked by SceneSection
     scene = _load_layer(scenario, place.field.file)
-    return field_sensor(scene, posed, camera, mount, *look, spp=place.spp)
+    sensor = field_sensor(scene, posed, camera, mount, *look, spp=place.spp)
+    if scenario.attack.attached:
+        _require_smooth(sensor, "scene.spp")
+    return sensor
+
+
+def _require_smooth(sensor: SceneSensor, key: str) -> None:
+    if (spp := sensor.camera.spp) < SMOOTH_SPP:
+        raise InputError(
+            f"attack.attached: {spp} rays per pixel, too few for a smooth objective; "
+            f"set {key} to {SMOOTH_SPP} or more"
+        )
 
 
 def build_rollout(world: World) -> tuple[Rollout, Any]:
-    """Make the drives that an attack is judged by; the policy needs no derivatives.
+    """Make the drives that an attack is judged by, and their initial states (m, n).
 
-    Args:
-        world: what the scenario describes.
-
-    Returns:
-        the drives, and the initial states (m, n) that they start from.
+    The policy needs no derivatives.
     """
     scenario, section = world.scenario, world.scenario.attack
     loop = world.loop(world.optimised)

@@ -193,6 +193,7 @@ to_world = [[2, 0, 0, 9], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]
 deployment = "deployment.xml"
 routes = "routes.json"
 route = "line"
+spp = 1
 [[objects]]
 id = "cube"
 field = "cube.safetensors"

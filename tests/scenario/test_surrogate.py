@@ -56,7 +56,7 @@ WALL = """\
         </transform>
     </shape>
 """
-FIELD, OBJECT = '[scene]\nfield = "scene.safetensors"', 'field = "object.safetensors"\n'
+FIELD, OBJECT = '[scene]\nfield = "scene.safetensors"\nspp = 1', 'field = "object.safetensors"\n'
 PLACED = "position_m = [7.0, 4.2, 1.6]\nscale = 1.5\n"
 NAMED = {FIELD: '[scene]\nsurrogate = "surrogate.xml"', OBJECT + PLACED: ""}
 
@@ -82,10 +82,14 @@ def test_keys_and_xml_describe_the_same_sensor(load):
     assert np.abs(one - other).max() < 1e-4 and one.std() > 0.01
 
 
-@pytest.mark.parametrize("spp", [1, 4])
-def test_rays_per_pixel(load, spp):
-    scenario = load({FIELD: f"{FIELD}\nspp = {spp}"})
-    assert build_surrogate(scenario).camera.spp == spp
+@pytest.mark.parametrize("changes", [{FIELD: FIELD.replace("1", "4")}, NAMED])
+def test_attached_takes_rays_enough(load, changes):
+    add = {"[attack]": "[attack]\nattached = true"}
+    with pytest.raises(InputError, match="rays per pixel, too few.*to 9 or more"):
+        build_surrogate(load(changes | add))
+    enough = {FIELD: FIELD.replace("1", "9")}
+    if changes is not NAMED:
+        assert build_surrogate(load(enough | add)).camera.spp == 9
 
 
 def test_files_of_the_scene_are_part_of_the_identity(load, tmp_path):

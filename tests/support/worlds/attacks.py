@@ -184,6 +184,7 @@ name = "kill"
 seed = 1
 [scene]
 field = "scene.safetensors"
+spp = 1
 deployment = "deployment.xml"
 routes = "routes.json"
 route = "line"
