@@ -240,5 +240,7 @@ def test_the_file_keeps_every_value(tmp_path):
     assert values.keys() == Calibration.model_fields.keys()
     write_calibration(path, Calibration(**values))
     assert read_calibration(path) == Calibration(**values)
+    write_calibration(path, Calibration())  # without a wheelbase
+    assert read_calibration(path) == Calibration()
     path.write_text("timeout_ms = 150\n")
     assert read_calibration(path) == Calibration(timeout_ms=150)
