@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
-
 import pytest
 
 from mi_nerfattack.errors import InputError
@@ -13,6 +11,7 @@ from mi_nerfattack.evaluation.sequential import (
     rate_interval,
     read_criteria,
 )
+from mi_nerfattack.io import files
 
 TEXT = """\
 case = "attack"
@@ -65,7 +64,7 @@ def test_criteria(tmp_path):
     path.write_text(TEXT)
     criteria = read_criteria(path)
     assert criteria.test == walk()
-    assert sequential.tested(criteria, [True])["criteria"] == tomllib.loads(TEXT)
+    assert sequential.tested(criteria, [True])["criteria"] == files.read_toml(path)
 
 
 @pytest.mark.parametrize(
