@@ -180,7 +180,7 @@ def rate_interval(successes: int, drives: int) -> list[float]:
         mean = betaln(successes + 1, failures + 1)
         return float(mean - likelihood) - math.log(20)
 
-    best, tiny = (successes / drives if drives else 0.5), 1e-300
+    best, tiny = successes / max(drives, 1), 1e-300
     low = root_scalar(excess, bracket=(tiny, best)).root if successes else 0.0
     high = root_scalar(excess, bracket=(best, 1 - 1e-16)).root if failures else 1.0
     return [float(low), float(high)]

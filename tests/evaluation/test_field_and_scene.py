@@ -115,6 +115,8 @@ def test_known_offset_in_depth_and_colour(offset):
     assert 0.2 - 0.01 < route.depth_median_m < route.depth_p90_m < 0.2 / cosine + 0.01
     nearer = 0.5 * (0.2 / 8 + 0.2 / 4)  # both distances hold half of the near rays
     assert 0.2 / 8 - 1e-3 < route.depth_median_relative < nearer
+    for at in route.stations[1:]:
+        assert 0.2 - 0.01 < at.depth_median_m < at.depth_p90_m < 0.2 / cosine + 0.01
     assert route.near == pytest.approx(2 / 3)
     (worst,) = worst_views(route.stations)
     assert worst.psnr_db == route.least("psnr_db")

@@ -29,6 +29,7 @@ def figures_of(*drives, seed=0):
         ("run", -1),
         ("states", np.zeros((2, 3))),
         ("time_s", np.array([0.2, 0.1])),
+        ("time_s", np.array([0.1, 0.1])),
         ("controls", np.array([0.0, np.nan])),
         ("controls", np.zeros(0)),
     ],
@@ -97,7 +98,9 @@ def test_time_out_of_the_lane_and_of_return():
     assert figures["wheel_out_s"] == pytest.approx(0.8 / 3)
     assert figures["centre_out_s"] == pytest.approx(0.2 / 3)
     uneven = make_drive([0.0, 1.0, 0.0], time_s=[0.1, 0.6, 0.7])
-    assert figures_of(uneven)["wheel_out_s"] == pytest.approx(0.5)
+    figures = figures_of(uneven)
+    assert figures["wheel_out_s"] == pytest.approx(0.5)
+    assert figures["drives_departed"] == 1  # by one step
 
 
 def test_the_mean_lies_in_its_interval():
@@ -144,6 +147,8 @@ def test_same_run_twice_and_missing_lane_are_refused():
 def test_document_follows_the_schema():
     document = json.loads(json.dumps(make_document()))
     metrics.validate(document)
+    two = {"frames": [4, 8], "objective": [0.1, -2.0]}
+    metrics.validate(document | {"curve": two | {"cross_track_mean_m": [0.1, 0.2]}})
     named = document["schema"], document["seed"], document["scenario"]
     assert named == (2, 7, {"name": "x"}) and document["cost"] == COST
     assert list(document["routes"]["straight"]["surrogate"]) == ["own", "random"]

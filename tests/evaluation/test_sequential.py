@@ -5,11 +5,13 @@ from __future__ import annotations
 import pytest
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.evaluation import sequential
 from mi_nerfattack.evaluation.sequential import (
     SequentialTest,
     rate_interval,
     read_criteria,
 )
+from mi_nerfattack.io import files
 
 TEXT = """\
 case = "attack"
@@ -60,7 +62,9 @@ def test_interval_at_any_time():
 def test_criteria(tmp_path):
     path = tmp_path / "criteria.toml"
     path.write_text(TEXT)
-    assert read_criteria(path).test == walk()
+    criteria = read_criteria(path)
+    assert criteria.test == walk()
+    assert sequential.tested(criteria, [True])["criteria"] == files.read_toml(path)
 
 
 @pytest.mark.parametrize(

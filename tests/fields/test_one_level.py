@@ -151,7 +151,9 @@ def test_an_attack_leaves_the_field_as_it_is_saved():
         values = [attack.step().objective for _ in range(3)]
         attack.finish()
         assert dr.width(item.packed) == 4 * item.n_vertices
-        found[one_level] = values, rollout.measure(initial).value
+        value = rollout.measure(initial).value
+        assert attack.judged_objective == pytest.approx(value, rel=1e-6)
+        found[one_level] = values, value
     (exact, judged), (near, near_judged) = found[False], found[True]
     assert near != exact
     np.testing.assert_allclose(near, exact, rtol=0.02)

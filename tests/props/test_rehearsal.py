@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.devices.car import WALL_NS
+from support.devices.car import LIMITS, WALL_NS
 from support.worlds.places import BlankView
 
 from mi_nerfattack.car.devices import Command, DeviceLostError, MotorValues, TrackedPose
@@ -16,7 +16,7 @@ from mi_nerfattack.car.drive.loop import Devices, DriveLoop, DriveSettings
 from mi_nerfattack.car.drive.pilot import expert_control
 from mi_nerfattack.car.drive.safety.fence import Fence
 from mi_nerfattack.car.drive.safety.judge import Ages, Cause, Judge
-from mi_nerfattack.car.drive.safety.limits import Limits, Steering
+from mi_nerfattack.car.drive.safety.limits import Steering
 from mi_nerfattack.deploy.car import SMALL_CAR
 from mi_nerfattack.deploy.environment import CameraFrame
 from mi_nerfattack.deploy.place import bundled_place
@@ -91,8 +91,8 @@ def drive(path, camera, room, duration_s: float, after_s=1.0, factor=1.0):
         lambda: expert_control(expert, tracker, "car"), room
     )
     judge = Judge(Ages(), Fence.around(line, 0.5), SMALL_CAR, 0.8, 0.1)
-    limits, steering = Limits(), Steering("rad", SMALL_CAR.wheelbase)
-    settings = DriveSettings("car", 1.0, judge, limits, steering, duration_s)
+    steering = Steering("rad", SMALL_CAR.wheelbase)
+    settings = DriveSettings("car", 1.0, judge, LIMITS, steering, duration_s)
     log = DriveLog(path, camera.camera, room.clock, WALL_NS, {})
     motor.arm()
     devices = Devices(camera, tracker, motor, pilot, Person(room, after_s))

@@ -90,7 +90,8 @@ def board() -> mi.Scene:
 def reflectance(loaded: mi.Scene) -> str:
     """Name the colours of the wall, or of the board."""
     keys = list(mi.traverse(loaded).keys())
-    return next(key for key in keys if key.endswith(("reflectance.value", ".data")))
+    ends = "brdf_0.reflectance.value", "brdf_0.reflectance.data"
+    return next(key for key in keys if key.endswith(ends))
 
 
 def drive_of(loaded: mi.Scene, keys: Any, horizon: int, **options: Any) -> Rollout:
@@ -203,6 +204,7 @@ def test_all_adjoints_agree_and_nothing_stays_attached(folder) -> None:
         found.append(drive.gradient(evaluation).parameters)
         assert not any(dr.grad_enabled(sensor.params[key]) for key in keys)
         assert not dr.grad_enabled(sensor.fields[0].packed)
+        assert not any(layer.has_pose_gradients for layer in sensor.layers)
     for key in keys[:2]:
         one, other = (parameters[key].numpy() for parameters in found)
         np.testing.assert_allclose(one, other, atol=1e-5 * np.abs(one).max())
@@ -255,6 +257,17 @@ def test_detached_values_are_set_too(folder) -> None:
     assert value[0] == pytest.approx(drive.measure(initial).value, rel=1e-6)
     np.testing.assert_allclose(sensor.params[KEY].numpy(), 0.9, rtol=1e-5)
     assert sensor.keys == (KEY,)
+
+
+def test_a_texture_of_another_size_is_shown(variant) -> None:
+    """A red board, whose scattered light is no more of the other colours."""
+    loaded, state = board(), to_state(STATE)
+    sensor, red = SceneSensor(loaded, toy.MOUNT), [0.9, 0.0, 0.0]
+    before = sensor.observe(state, 0).linear.numpy()
+    texture = mi.TensorXf(np.full((4, 2, 3), red, np.float32))
+    sensor.set_parameters({reflectance(loaded): texture})
+    change = sensor.observe(state, 0).linear.numpy() - before
+    assert change[0].max() > 0.1 and change[1:].min() < -0.1
 
 
 def test_nothing_is_left_of_a_gradient_that_failed_or_of_images(folder) -> None:

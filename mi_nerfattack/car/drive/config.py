@@ -191,10 +191,10 @@ class DriveConfig(Section):
         if self.control_unit == "rad/s":
             most = heading_rate(most, route.speed_ms, self.wheelbase_m)
         limits = Limits(
-            self.max_speed_ms,
-            self.max_steering_rad,
-            self.max_acceleration_ms2,
-            self.max_steering_rate,
+            speed_ms=self.max_speed_ms,
+            steering_rad=self.max_steering_rad,
+            acceleration_ms2=self.max_acceleration_ms2,
+            steering_rate=self.max_steering_rate,
         )
         return DriveSettings(
             body=self.body,

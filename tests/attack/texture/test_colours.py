@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -120,6 +122,8 @@ def test_statistics_of_a_texture_that_is_known():
     assert found.total_variation == pytest.approx(0, abs=1e-6)
     assert same.spectrum == []
     assert found.spectrum[-1] == pytest.approx(1)  # all of it is the mean
+    unseen = texture_statistics(grid, grey, np.zeros_like(weights))
+    assert astuple(unseen) == (0, 0, 0, 0, [])
 
 
 def test_measuring_that_fails_leaves_the_texture(monkeypatch):

@@ -94,6 +94,7 @@ def test_penalty_is_the_variation_and_its_gradient_that_of_it(field, rng):
 
 test_what_allows_nothing_is_refused = refusals(
     (lambda: Constraints(lowest=0.6, highest=0.5), "lowest: 0.6, highest: 0.5"),
+    (lambda: Constraints(lowest=0.5, highest=0.5), "expected lowest < highest"),
     (lambda: Constraints(lowest=0.995), r"0\.01"),
     (lambda: Constraints(highest=0.005), r"0\.01"),
     (lambda: Constraints(fixed=(((0, 0, 0), (1, 0, 1)),)), "fixed: "),

@@ -41,6 +41,7 @@ def test_options_come_before_the_file_whose_paths_start_from_its_folder(tmp_path
     assert route.name == "square" and route.speed_ms == 0.4  # the limit
     settings = config.settings(route)
     np.testing.assert_array_equal(settings.judge.fence.points[2], (3.0, 3.0))
+    assert settings.judge.fence.holds(np.zeros((1, 2)))
     assert settings.limits.speed_ms == 0.4 and settings.speed_ms == 0.4
 
 

@@ -9,13 +9,14 @@ import sys
 import threading
 import time
 from contextlib import closing, nullcontext
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.devices.car import Bench, StandInTracker
+from support.devices.car import JUDGE, Bench, StandInTracker
 from support.faults.injected import wait_for
 
 from mi_nerfattack.car.devices import (
@@ -23,6 +24,7 @@ from mi_nerfattack.car.devices import (
     Decision,
     DeviceLostError,
     Frame,
+    MotorValues,
     TrackedPose,
 )
 from mi_nerfattack.car.drive.pilot import LocalPilot
@@ -36,6 +38,7 @@ from mi_nerfattack.car.drive.safety.enable import (
 from mi_nerfattack.car.drive.safety.fence import Fence, car_corners
 from mi_nerfattack.car.drive.safety.judge import Ages, Judge, Stop
 from mi_nerfattack.car.drive.safety.limits import Limits, Steering
+from mi_nerfattack.car.drive.safety.speeds import Speeds
 from mi_nerfattack.deploy.car import SMALL_CAR
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import planar_body
@@ -60,7 +63,7 @@ def test_what_is_within_the_limits_is_sent():
         with pytest.raises(InputError, match="must be finite"):
             LIMITS.apply(wrong, last, 0.1)
     with pytest.raises(InputError, match="limits.speed_ms: 0"):
-        Limits(speed_ms=0.0)
+        replace(LIMITS, speed_ms=0.0)
 
 
 def test_a_heading_rate_becomes_the_angle_that_turns_so_fast():
@@ -121,6 +124,21 @@ def test_a_fence_does_not_reach_into_the_car(tip, turn):
     assert Fence(placed(square)).encloses(corners)
     with pytest.raises(Stop, match="outside the fence: the car is at x 0.30 m"):
         judged(fence, body)
+
+
+def test_a_battery_at_its_least_voltage_is_not_low():
+    judge = replace(JUDGE, battery_least_v=9.6)
+    judge.motor(MotorValues(0.0, input_voltage_v=9.6))
+    with pytest.raises(Stop, match="9.5 V, at least 9.6 V"):
+        judge.motor(MotorValues(0.0, input_voltage_v=9.5))
+
+
+def test_values_that_are_read_twice_count_once():
+    """The mean over 0.3 s is that of 1, 2 and 3 m/s."""
+    speeds = Speeds()
+    for tenth, speed_ms in ((0, 5.0), (1, 1.0), (2, 2.0), (3, 3.0), (3, 3.0)):
+        speeds.add(None, MotorValues(tenth / 10, speed_ms))
+    assert speeds.motor() == pytest.approx(2.0)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not tell")

@@ -147,6 +147,16 @@ def test_what_a_check_raises_brakes_a_drive(armed):
         drive_arc(motor, Command(0.5, 0.0), 1.5, lambda: None)
 
 
+def test_an_arc_gives_what_the_servo_and_the_motor_did(armed):
+    car, motor = armed
+    start_m = car.wait_for(speed_ms=0.0)[-1]["way_m"]
+    servo, steps = drive_arc(motor, Command(0.5, 0.1), 0.2, lambda: None)
+    assert servo == pytest.approx(0.409)  # 0.5304 - 1.2135 * 0.1, in thousandths
+    assert any(line["servo"] == servo for line in car.log())
+    way_m = car.wait_for(speed_ms=0.0)[-1]["way_m"] - start_m
+    assert 0.2 <= way_m == pytest.approx(steps / (ERPM_PER_MS / 10), abs=0.005)
+
+
 def test_no_arc_is_driven_while_another_program_feeds_the_controller(armed):
     car, motor = armed
     before = len(car.log())

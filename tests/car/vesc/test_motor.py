@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import termios
+import threading
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -20,6 +21,7 @@ from support.devices.controller import StandIn
 from support.faults.injected import wait_for
 
 from mi_nerfattack.car.devices import Command, DeviceLostError, MotorValues
+from mi_nerfattack.car.vesc import timeout
 from mi_nerfattack.car.vesc.calibration import Calibration
 from mi_nerfattack.car.vesc.guided import drive_arc
 from mi_nerfattack.car.vesc.link import WRITE_S, SerialLink
@@ -94,6 +96,7 @@ def test_a_car_that_nobody_commands_stops(opened):
     with pytest.raises(InputError, match="not armed"):
         motor.send(Command(1.0, 0.0))
     motor.arm()
+    assert max(line["speed_ms"] for line in car.log()) == pytest.approx(0.5, abs=0.02)
     events = [line["event"] for line in car.log()]
     assert events.count("memory") == 1 and "flash" not in events
     drive_to_speed(motor, car)
@@ -214,6 +217,21 @@ def test_a_pause_of_the_computer_is_no_fault_of_the_port(line, monkeypatch):
     assert b"abc" in os.read(far, 100)
 
 
+def test_a_port_that_is_closed_is_read_no_more(line, monkeypatch):
+    (link, _), reads = line, threading.Event()
+
+    def read(*_):
+        reads.set()
+        time.sleep(0.1)
+        return b""
+
+    monkeypatch.setattr(serial.Serial, "read", read)
+    assert reads.wait(10)
+    link.close()
+    assert f"VESC {link.port}" not in {thread.name for thread in threading.enumerate()}
+    link.close()
+
+
 def test_a_port_that_takes_nothing_is_lost(line):
     link, _ = line
     with pytest.raises(DeviceLostError, match="takes nothing for 0.1 s; check its"):
@@ -289,6 +307,14 @@ def test_what_is_not_armed(opened, message):
     with pytest.raises(InputError, match="not armed"):
         motor.send(Command(1.0, 0.0))
     car.wait_for_line(event="command 7")  # it brakes, as well as it can
+
+
+def test_a_computer_that_is_too_busy_proves_no_timeout(opened, monkeypatch):
+    _, motor = opened
+    monkeypatch.setattr(timeout, "_LATE_S", -1.0)  # no answer is early enough
+    monkeypatch.setattr(timeout, "_TRIES", 1)
+    with pytest.raises(InputError, match="this computer was too busy, 1 times"):
+        motor.arm()
 
 
 class LetGoError(Exception):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from support.devices.vesc import frame
 
 from mi_nerfattack.car.devices import Command
-from mi_nerfattack.car.vesc import messages
+from mi_nerfattack.car.vesc import messages, timeout
 from mi_nerfattack.car.vesc.calibration import (
     Calibration,
     read_calibration,
@@ -188,6 +188,22 @@ def test_selected_values():
     assert found == messages.Values(erpm=4614, input_voltage_v=15.7, fault=0, status=1)
 
 
+@pytest.mark.parametrize(
+    ("before_a", "after_a", "braked"),
+    [
+        ([0.0, 3.0], -20.0, True),
+        ([0.2], -4.0, False),  # less than a quarter of 20 A
+        ([0.2], 6.0, True),
+        ([0.2, 5.0], 6.0, False),  # hardly more than what turned the wheels
+        ([], 6.0, True),  # the timeout had fired before the first value
+    ],
+)
+def test_a_current_that_brakes(before_a, after_a, braked):
+    seen = [messages.Values(motor_current_a=value, status=0) for value in before_a]
+    seen.append(messages.Values(motor_current_a=after_a, status=1))
+    assert timeout._is_braked(seen, 20.0) is braked
+
+
 def test_faults_have_names():
     names = {0: "none", 2: "under voltage", 18: "unbalanced currents", 77: "fault 77"}
     assert {number: messages.fault_name(number) for number in names} == names
@@ -240,5 +256,7 @@ def test_the_file_keeps_every_value(tmp_path):
     assert values.keys() == Calibration.model_fields.keys()
     write_calibration(path, Calibration(**values))
     assert read_calibration(path) == Calibration(**values)
+    write_calibration(path, Calibration())  # without a wheelbase
+    assert read_calibration(path) == Calibration()
     path.write_text("timeout_ms = 150\n")
     assert read_calibration(path) == Calibration(timeout_ms=150)

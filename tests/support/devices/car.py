@@ -27,8 +27,9 @@ FRAME_LATENCY_S, POSE_LATENCY_S, DECISION_S = 0.03, 0.004, 0.02
 SPEED, RADIUS = 1.0, 1.5
 FENCE = Fence(np.array([(-3.0, -3.0), (3.0, -3.0), (3.0, 3.0), (-3.0, 3.0)]))
 JUDGE = Judge(Ages(), FENCE, SMALL_CAR, 0.8, 0.1)
+LIMITS = Limits(speed_ms=1.5, steering_rad=0.4, acceleration_ms2=1.0, steering_rate=3.2)
 SETTINGS = DriveSettings(
-    "car", SPEED, JUDGE, Limits(), Steering("rad", 0.325), poll_s=0.01
+    "car", SPEED, JUDGE, LIMITS, Steering("rad", 0.325), poll_s=0.01
 )
 
 

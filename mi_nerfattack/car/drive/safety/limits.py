@@ -25,10 +25,10 @@ class Limits:
         steering_rate: of the angle that is asked for, radians per second.
     """
 
-    speed_ms: Positive = 1.5
-    steering_rad: Acute = 0.4
-    acceleration_ms2: Positive = 1.0
-    steering_rate: Positive = 3.2
+    speed_ms: Positive
+    steering_rad: Acute
+    acceleration_ms2: Positive
+    steering_rate: Positive
 
     def apply(self, wanted: Command, before: Command, elapsed_s: float) -> Command:
         """Return the command nearest to the wanted one that may be sent.
