@@ -56,7 +56,10 @@ WALL = """\
         </transform>
     </shape>
 """
-FIELD, OBJECT = '[scene]\nfield = "scene.safetensors"\nspp = 1', 'field = "object.safetensors"\n'
+FIELD, OBJECT = (
+    '[scene]\nfield = "scene.safetensors"\nspp = 1',
+    'field = "object.safetensors"\n',
+)
 PLACED = "position_m = [7.0, 4.2, 1.6]\nscale = 1.5\n"
 NAMED = {FIELD: '[scene]\nsurrogate = "surrogate.xml"', OBJECT + PLACED: ""}
 
