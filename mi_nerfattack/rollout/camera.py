@@ -38,7 +38,7 @@ class SceneCamera:
         sensor: Any,
         mount: CameraMount,
         seed: int,
-        centred: bool = False,
+        centred: bool,
         first: int = 0,
     ) -> None:
         self.sensor: Any = sensor
