@@ -12,7 +12,7 @@ and the ray gathers ``sum_k w_k L_k`` of radiance and ``sum_k w_k t`` of moment.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -52,8 +52,8 @@ class Sums:
         shares: what each field gave.
     """
 
-    tau: mi.Float = field(default_factory=lambda: mi.Float(0))
-    shares: list[March] = field(default_factory=list)
+    tau: mi.Float
+    shares: list[March]
 
     @staticmethod
     def zeros(fields: int) -> Sums:
@@ -99,10 +99,10 @@ class Rest:
         passed: (n,), transmittance of the whole ray.
     """
 
-    tau: mi.Float = field(default_factory=lambda: mi.Float(0))
-    radiance: mi.Color3f = field(default_factory=lambda: mi.Color3f(0))
-    moment: mi.Float = field(default_factory=lambda: mi.Float(0))
-    passed: mi.Float = field(default_factory=lambda: mi.Float(1))
+    tau: mi.Float
+    radiance: mi.Color3f
+    moment: mi.Float
+    passed: mi.Float
 
     @staticmethod
     def of(primal: March) -> Rest:

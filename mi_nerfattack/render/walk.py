@@ -165,9 +165,9 @@ def seek(
 class Cursor:
     """One field's lattice interval at or ahead of the march, metres."""
 
-    following: mi.Float = field(default_factory=lambda: mi.Float(0))
-    start: mi.Float = field(default_factory=lambda: mi.Float(0))
-    end: mi.Float = field(default_factory=lambda: mi.Float(0))
+    following: mi.Float
+    start: mi.Float
+    end: mi.Float
 
     @staticmethod
     def before(path: Path) -> Cursor:

@@ -40,7 +40,7 @@ class SceneCamera:
         sensor: Any,
         mount: CameraMount,
         seed: int,
-        centred: bool = False,
+        centred: bool,
         first: int = 0,
         variation: Variation | None = None,
     ) -> None:

@@ -90,6 +90,14 @@ def test_any_layers_against_a_sequential_fold(layers) -> None:
         np.testing.assert_allclose(parts, whole, atol=1e-5)
 
 
+def test_a_march_differs_from_nothing_in_any_part() -> None:
+    black, white, green = np.array([[0, 0, 0], [1, 1, 1], [0, 0.5, 0]])
+    rows = [(black, 0, 0), (white, 0, 0), (green, 0, 0), (black, 0.5, 0), (black, 0, 2)]
+    colours, opacity, moment = map(list, zip(*rows, strict=True))
+    one = March(mi.Color3f(np.array(colours).T), mi.Float(opacity), mi.Float(moment))
+    assert one.differs().numpy().tolist() == [False, True, True, True, True]
+
+
 def test_layer_behind_an_opaque_one_has_no_gradient() -> None:
     front, back = layer(RED, 1.0, 2.0), layer(BLUE, 0.5, 3.0)
     dr.enable_grad(front, back)

@@ -15,7 +15,7 @@ from support.worlds import fields as small
 from mi_nerfattack.fields import GridField, GridLayout, Occupancy
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.march import march
-from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.posed import PosedField, object_footprints
 from mi_nerfattack.render.rays import March
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -138,6 +138,31 @@ def test_lattice_grows_with_the_cone() -> None:
     np.testing.assert_allclose(t, expected, rtol=1e-5)
     back = posed.lattice_index(mi.Float(t)).numpy()
     np.testing.assert_allclose(back, [0, 5, 10, 11, 20], rtol=2e-4, atol=1e-3)
+
+
+def test_a_transform_that_changes_is_followed() -> None:
+    posed = PosedField(small.homogeneous(SIGMA))
+    posed.move(np.array([0, 9.0, 0, 0, 0, 0]))
+    matrix = np.diag([2.0, 2, 2, 1])
+    matrix[0, 3] = 0.5
+    mi.set_property(posed.to_world, mi.AffineTransform4f(matrix))
+    posed.follow("to_world")
+    assert posed.pose.scale == pytest.approx(2) and not posed.offset.any()
+    origin, direction = mi.Point3f(-5, 0.1, 0.2), mi.Vector3f(1, 0, 0)
+    dr.make_opaque(origin, direction)
+    seen = march(*small.arguments(posed, origin, direction), 0.0)
+    # twice as large from x = -1.5 on, and half as dense
+    opacity, depth = slab(3.5, 4, SIGMA / 2)
+    assert seen.opacity[0] == pytest.approx(opacity, rel=1e-4)
+    assert seen.depth[0] == pytest.approx(depth, abs=2e-4)
+
+
+def test_footprints_are_where_boxes_stand() -> None:
+    corners = np.array([-1.0, -2, 0]), np.array([3.0, 4, 1])
+    field = GridField(GridLayout(1, 4, 4), *corners)
+    pose = Pose.upright((10, 20, 5), np.pi / 2, 2.0)  # (x, y) to (10 - 2 y, 20 + 2 x)
+    (found,) = object_footprints([PosedField(field, pose)])
+    np.testing.assert_allclose(found, [[14, 18], [14, 26], [2, 26], [2, 18]])
 
 
 TRANSPOSED = np.eye(4)

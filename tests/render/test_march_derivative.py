@@ -10,12 +10,14 @@ from support.files import objects as made
 from support.reference.derivatives import central_difference
 from support.worlds import fields as small
 
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import AbstractField, GridField, GridLayout, Occupancy
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.composite import DepthComposite, Seen
 from mi_nerfattack.render.interleaved import InterleavedComposite
-from mi_nerfattack.render.march import march
+from mi_nerfattack.render.march import march, march_derivative
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March, Rays
 from mi_nerfattack.render.splatting.background import SplatBackground
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -166,12 +168,49 @@ def check_rays(case: Case, rng, h: float, tolerance: float) -> None:
         assert found == pytest.approx(expected, rel=tolerance, abs=1e-3)
 
 
+def test_derivative_by_the_density_of_a_slab() -> None:
+    # The second of the rays misses the slab.
+    origin = mi.Point3f([-3, -3], [0.1, 5], 0.2)
+    posed = PosedField(small.homogeneous(0.7))
+    rays = small.arguments(posed, origin, mi.Vector3f(1, 0, 0) + 0 * origin)[1]
+    seen = march(posed, rays, 0.0)
+    one = mi.Float(1, 1)
+    cotangent = March(mi.Color3f(0.5, -2, 1) * one, 0.3 * one, -0.4 * one)
+    backward = dr.ADMode.Backward
+    _, found = march_derivative(backward, posed, rays, seen, cotangent, 0.0, True)
+    colour = small.sigmoid_to_linear(np.array(0.3))
+
+    def objective(s: float) -> float:
+        density = 0.7 * np.exp(s)
+        passed = np.exp(-2 * density)
+        moment = 2 * (1 - passed) + 1 / density - (2 + 1 / density) * passed
+        return (-0.5 * colour + 0.3) * (1 - passed) - 0.4 * moment
+
+    expected = [central_difference(objective, 1e-4), 0]
+    np.testing.assert_allclose(found.log_density.numpy(), expected, rtol=1e-3)
+
+
 def test_origin_and_direction_within_one_cell(rng: np.random.Generator) -> None:
     # No kinks, and rays that begin and end inside: the derivative is exact.
     field = GridField(GridLayout(1, 2, 2), -small.ONES, small.ONES, step_m=0.05)
     noise = rng.normal(size=(field.n_vertices, 4)).astype(np.float32)
     field.packed = mi.Float(noise.ravel())
     check_rays(Case(rng, field, inside=True), rng, 1e-2, 1e-3)
+
+
+def test_bricks_have_no_derivatives_by_rays(rng) -> None:
+    back, front = PosedField(small.small_bricks(rng)), PosedField(small.blob(rng))
+    layers, composite = [back, front], DepthComposite()
+    rays = Rays(*small.fan(rng)[:2])
+    seen = composite.render(layers, rays, 0.0)
+    cotangent = Seen(small.random_march(rng, dr.width(rays.direction)))
+    with pytest.raises(InputError, match="keep the camera detached") as caught:
+        composite.backward_rays(layers, rays, seen, cotangent, 0.0, [0, 1])
+    assert caught.value.where == "brick_field"
+    # the objects among them have such derivatives, which poses are attacked by
+    (found,) = composite.backward_rays(layers, rays, seen, cotangent, 0.0, [1])
+    by_origin = found.origin.numpy()
+    assert np.isfinite(by_origin).all() and by_origin.any()
 
 
 def test_direction_also_turns_the_view_of_an_ngp(rng: np.random.Generator) -> None:

@@ -21,7 +21,7 @@ from mi_nerfattack.deploy.surrogate.scene import field_sensor
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.splats import Splats
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.render.composite import DepthComposite, Seen
+from mi_nerfattack.render.composite import DepthComposite
 from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
@@ -133,19 +133,33 @@ def test_small_and_thin_splats_far_away_are_not_missed(rng) -> None:
         assert error.max() < 0.02
 
 
-@pytest.mark.parametrize("count", [3, 90])
-def test_rays_may_come_from_many_origins(rng, count: int) -> None:
+@pytest.mark.parametrize(("count", "each"), [(3, 40), (3, 1), (90, 40)])
+def test_rays_may_come_from_many_origins(rng, count: int, each: int) -> None:
     """Vehicles side by side, or places in the aperture of a lens."""
     item = made.cloud(rng, 300)
     origins = rng.uniform(-0.4, 0.4, (count, 3)).astype(np.float32) + [-6, 0, 0]
-    aims = np.array([3, 0, 0]) + rng.normal(0, 0.4, (count, 40, 3))
+    aims = np.array([3, 0, 0]) + rng.normal(0, 0.4, (count, each, 3))
     aims = (aims / np.linalg.norm(aims, axis=2)[..., None]).astype(np.float32)
-    seen = look(item, np.repeat(origins, 40, 0), aims.reshape(-1, 3))
-    found = seen.opacity.numpy().reshape(count, 40), seen.moment.numpy()
+    seen = look(item, np.repeat(origins, each, 0), aims.reshape(-1, 3))
+    found = seen.opacity.numpy().reshape(count, each), seen.moment.numpy()
     for k, (origin, directions) in enumerate(zip(origins, aims, strict=True)):
         _, opacity, moment = made.reference(item, origin, directions)
         np.testing.assert_allclose(found[0][k], opacity, atol=1e-5)
-        np.testing.assert_allclose(found[1].reshape(count, 40)[k], moment, atol=2e-4)
+        np.testing.assert_allclose(found[1].reshape(count, each)[k], moment, atol=2e-4)
+
+
+def test_many_along_a_ray_are_sorted_by_depth(rng) -> None:
+    places = rng.permutation(np.linspace(0.5, 60, 300))[:, None] * [1, 0, 0]
+    sizes = rng.uniform(0.02, 0.2, 300)
+    item = made.splats(places, rng.random((300, 3)), 0.02, sizes)
+    # against their order in memory
+    ray = np.array([61.0, 0, 0]), np.array([[-1.0, 0, 0]])
+    display, opacity, moment = made.reference(item, *ray)
+    seen = look(item, *ray)
+    assert float(seen.opacity[0]) == pytest.approx(opacity[0], rel=1e-4)
+    assert float(seen.moment[0]) == pytest.approx(moment[0], rel=1e-4)
+    expected = linear(display, opacity)
+    np.testing.assert_allclose(seen.radiance.numpy().T, expected, rtol=1e-4)
 
 
 def test_rays_end_where_little_is_passed_or_nothing_is_met() -> None:
@@ -218,21 +232,6 @@ def test_a_splat_hides_and_is_hidden_by_depth(x: float) -> None:
     assert float(seen.total.opacity[0]) == pytest.approx(a + (1 - a) * b, rel=2e-4)
     moment = a * near + (1 - a) * b * far
     assert float(seen.total.moment[0]) == pytest.approx(moment, rel=2e-4)
-
-
-def test_bricks_have_no_derivatives_by_rays(rng) -> None:
-    back, front = PosedField(small.small_bricks(rng)), PosedField(small.blob(rng))
-    layers, composite = [back, front], DepthComposite()
-    rays = Rays(*small.fan(rng)[:2])
-    seen = composite.render(layers, rays, 0.0)
-    cotangent = Seen(small.random_march(rng, dr.width(rays.direction)))
-    with pytest.raises(InputError, match="keep the camera detached") as caught:
-        composite.backward_rays(layers, rays, seen, cotangent, 0.0, [0, 1])
-    assert caught.value.where == "brick_field"
-    # the objects among them have such derivatives, which poses are attacked by
-    (found,) = composite.backward_rays(layers, rays, seen, cotangent, 0.0, [1])
-    by_origin = found.origin.numpy()
-    assert np.isfinite(by_origin).all() and by_origin.any()
 
 
 # Derivatives
@@ -310,6 +309,12 @@ def test_derivatives_by_rays_are_those_of_the_float64_sum(derived, name) -> None
         step = STEP * np.eye(3)[axis]
         pair = [derived.expected(**{key: sign * step}) for sign in (1, -1)]
         agree(found[axis], (pair[0] - pair[1]) / (2 * STEP))
+
+
+def test_derivatives_by_rays_are_0_unless_asked_for(derived) -> None:
+    fixed = derived.rays, derived.seen, derived.cotangent, 0.0
+    _, by_rays = derived.splats.derivative(dr.ADMode.Backward, *fixed)
+    assert not by_rays.origin.numpy().any() and not by_rays.direction.numpy().any()
 
 
 def test_tangents_are_the_transpose(derived, rng) -> None:

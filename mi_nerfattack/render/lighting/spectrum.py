@@ -121,9 +121,7 @@ def _table(variant: str) -> mi.Float:
     del variant  # the arrays' type follows from it
     illuminant = mi.cie_d65(mi.Float(_nodes())).numpy()
     columns = np.vstack([basis(), illuminant]).astype(np.float32)
-    table = mi.Float(columns.T.ravel())
-    dr.make_opaque(table)
-    return table
+    return mi.Float(columns.T.ravel())
 
 
 def _nodes() -> np.ndarray:

@@ -9,7 +9,7 @@ bounding box where the field begins at once: ``sigma (z - t_near) / a dt_near/do
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -32,9 +32,9 @@ class Surface:
         active: (n,) mask; whether the ray meets anything.
     """
 
-    point: mi.Point3f = field(default_factory=lambda: mi.Point3f(0))
-    normal: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0, 0, 1))
-    active: mi.Bool = field(default_factory=lambda: mi.Bool(True))
+    point: mi.Point3f
+    normal: mi.Vector3f
+    active: mi.Bool
 
 
 class Geometry(AbstractField):

@@ -172,7 +172,6 @@ class SplatBackground(AbstractBackdrop):
                 dr.enable_grad(shades)
                 if mode == dr.ADMode.Forward:
                     dr.set_grad(shades, dr.forward_to(attached))
-            dr.eval(shades)
             lines = by_cell(rays, where, lists)
             fixed = pick_rays([primal, cotangent], where.order)
             with private_gradients():

@@ -7,14 +7,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import expm
+from scipy.linalg import expm, polar
 from scipy.spatial.transform import Rotation
 from support.worlds.cameras import NARROW
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera import conventions as conv
 from mi_nerfattack.render.camera.intrinsics import Camera, look_at
-from mi_nerfattack.render.camera.pose import poses_at
+from mi_nerfattack.render.camera.pose import (
+    Pose,
+    check_rigid,
+    nearest_rigid,
+    poses_at,
+)
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -65,9 +70,9 @@ def test_colmap_pose_of_any_rotation(axis, angle, place):
     # world to camera is the opposite turn
     quaternion = np.array([np.cos(angle / 2), *(-np.sin(angle / 2) * axis)])
     translation = -expm(-angle * cross) @ place
-    for scale in (3, 1e-200, 1e200):
-        back = conv.colmap_to_opencv(scale * quaternion, translation)
-        np.testing.assert_allclose(back, matrix, atol=1e-9)
+    scales = np.array([[3], [1e-200], [1e200]])
+    back = conv.colmap_to_opencv(scales * quaternion, [translation] * 3)
+    np.testing.assert_allclose(back, [matrix] * 3, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -80,6 +85,10 @@ def test_colmap_pose_of_any_rotation(axis, angle, place):
         (lambda: conv.from_colmap("PINHOLE", 4, 4, [4, 2, 2]), "camera model PINHOLE"),
         (lambda: conv.from_colmap("SIMPLE_PINHOLE", 4, 4, [-4, 2, 2]), "camera.fx"),
         (lambda: conv.from_mitsuba(mi.load_dict({"type": "orthographic"})), "sensor"),
+        (lambda: check_rigid(np.full((4, 4), np.nan), "a.json"), "a.json"),
+        (lambda: check_rigid(np.diag([2.0, 1, 1, 1]), "a.json"), "a.json"),
+        (lambda: check_rigid(np.diag([1.0, 1, -1, 1]), "a.json"), "a.json"),
+        (lambda: check_rigid(np.diag([1.0, 1, 1, 2]), "a.json"), "a.json"),
     ],
 )
 def test_what_cannot_be_converted(call, where):
@@ -126,6 +135,24 @@ def test_mitsuba_sensor_and_back(camera, kind):
     back, pose_back = conv.from_mitsuba(mi.load_dict(description, parallel=False))
     np.testing.assert_allclose(pose_back, to_world, atol=1e-6)
     assert vars(back) == pytest.approx(vars(camera), rel=1e-6)
+
+
+# Poses by themselves
+
+
+def test_a_pose_scales_then_turns_then_moves():
+    pose = Pose.upright((5.0, 6, 7), np.pi / 2, 2.0)
+    points = np.array([[1.0, 0, 0], [0, 1, 3]])
+    np.testing.assert_allclose(pose.apply(points), [[5, 8, 7], [3, 6, 13]], atol=1e-12)
+    np.testing.assert_allclose(pose.to_local(pose.apply(points)), points, atol=1e-12)
+
+
+def test_a_rounded_pose_becomes_the_nearest_rigid_one():
+    rounded = moving(np.array([0.7]))[0].round(3)
+    found = nearest_rigid(rounded, "a.json")
+    np.testing.assert_allclose(found[:3, :3], polar(rounded[:3, :3])[0], atol=1e-12)
+    np.testing.assert_array_equal(found[:, 3], rounded[:, 3])
+    np.testing.assert_array_equal(found[3], [0, 0, 0, 1])
 
 
 # Poses between tracked ones, against a motion whose formula is known

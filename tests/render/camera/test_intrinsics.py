@@ -74,6 +74,7 @@ def test_mount_pose_agrees_with_matrix():
 def test_rays_agree_with_mitsubas_sensor(lens):
     camera = cam.Camera(20, 12, *lens)
     origin, directions = rays_of(camera)
+    assert origin.shape == (3, 240)
     row, column = np.mgrid[0:12, 0:20]
     place = np.stack([(column + 0.5) / 20, (row + 0.5) / 12]).reshape(2, -1)
     sensor = mi.load_dict(mitsuba_sensor_dict(camera, POSE, 1))
@@ -213,6 +214,34 @@ def test_opencv_projects_rays_back_to_their_pixels(camera):
         slope = (np.array(ahead) - np.array(back)) / (2 * step)
         np.testing.assert_allclose(slope, expected, atol=1e-7)
     np.testing.assert_allclose(determinant, xx * yy - xy * xy, rtol=1e-12)
+
+
+def test_a_fisheye_shows_its_middle_as_it_is():
+    middle = np.zeros(1)
+    found = distortion.jacobian(middle, middle, *NARROW.distortion)
+    np.testing.assert_allclose(np.ravel(found), [1, 0, 1, 1])
+
+
+def test_a_lens_far_out_of_true_is_undone_to_the_last_digits():
+    x, y = np.meshgrid(np.linspace(-0.6, 0.6, 9), np.linspace(-0.4, 0.4, 7))
+    coefficients = -0.2, 0.05, 0.06, -0.05
+    bent = distortion.distort(x, y, *coefficients)
+    found = distortion.undistort(*bent, *coefficients)
+    np.testing.assert_allclose(found, (x, y), rtol=0, atol=1e-13)
+
+
+def test_cameras_of_one_lens_are_told_apart():
+    cameras = [RADIAL, replace(RADIAL, fx=40.0, k1=0.1)]
+    place = np.array([[10.0, 20, 30], [5, 9, 30]])
+    index = [1, 0, 1]
+    _, found = lens.lens_rays(
+        lens.Lens(cameras).of(mi.UInt32(index)),
+        mi.Point3f(0),
+        tuple(mi.Vector3f(*row) for row in np.eye(3).tolist()),
+        mi.Point2f(place.astype(np.float32)),
+    )
+    both = np.stack([directions(camera, *place) for camera in cameras])
+    np.testing.assert_allclose(found.numpy().T, both[index, range(3)], atol=2e-6)
 
 
 # Files, and what is refused

@@ -28,6 +28,13 @@ def test_a_map_to_scale_is_what_the_camera_sees():
     np.testing.assert_allclose(growth, 1 / (1 - 10 / overhead.height_m))
 
 
+def test_what_is_high_moves_outwards_by_a_28th_of_its_height_at_most():
+    overhead = Overhead((-50.0, -50.0), 1.0, 100, 100)
+    corner = np.array([[50.0, 50.0, 0.0], [50.0, 50.0, 10.0]])
+    seen = seen_at(overhead.camera, overhead.camera_to_world, corner)
+    assert np.linalg.norm(seen[1] - seen[0]) == pytest.approx(10 / 28, rel=0.01)
+
+
 def test_from_behind_the_car_is_in_the_middle_and_the_road_ahead():
     state = np.array([3.0, -2.0, 0.7])
     camera, mount = from_fov(300, 200, 75.0), chase_mount(1.8)

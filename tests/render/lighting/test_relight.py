@@ -22,7 +22,7 @@ from support.worlds.fields import T
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, GridLayout, save_field
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.render.lighting.relight import Relighting
+from mi_nerfattack.render.lighting.relight import Relighting, ratio
 from mi_nerfattack.render.lighting.surface import expected_surface, geometry
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import Rays
@@ -133,13 +133,20 @@ def ground_gain(x: np.ndarray, y: np.ndarray, samples: int, **emitters: Any):
 def test_a_shadow_falls_where_geometry_says() -> None:
     # Light along (-1, 0, -1): the box [-1, 1]^2 x [1, 3] shades -4 < x < 0, |y| < 1.
     x, y = np.meshgrid(np.linspace(-5, 2, 29) + 0.11, np.linspace(-2, 2, 17) + 0.07)
-    x, y = x.ravel(), y.ravel()
+    # The last of the rays misses the ground, |x| < 8, and keeps its colour.
+    x, y = np.append(x, 20), np.append(y, 0)
     found = ground_gain(x, y, 1, sun=sun(-1, 0, -1))
     shaded = (x > -4) & (x < 0) & (np.abs(y) < 1)
     # Shadow rays start 2 steps of 0.08 m above the ground, so sideways 0.16 m.
     edge = (np.abs(x) < 0.2) | (np.abs(x + 4) < 0.2) | (np.abs(np.abs(y) - 1) < 0.05)
     for channel in found.T:
         np.testing.assert_allclose(channel[~edge], 1.0 - shaded[~edge], atol=1e-5)
+
+
+@pytest.mark.usefixtures("variant")
+def test_a_shadow_neither_brightens_nor_darkens_what_is_unlit() -> None:
+    lit, unshadowed = mi.Color3f(0.5, 3, 0), mi.Color3f(2, 2, 0)
+    np.testing.assert_allclose(np.ravel(ratio(lit, unshadowed)), [0.25, 1, 1])
 
 
 def corner_factor(a: float) -> float:
@@ -200,6 +207,33 @@ def test_the_face_of_a_box(rng: np.random.Generator, density: float) -> None:
     reach = 2 / d.x.numpy()  # mean depth in a slab of optical depth D:
     mean = 1 / density - reach / np.expm1(np.minimum(density * reach, 50))
     np.testing.assert_allclose(along, mean, atol=0.01)
+
+
+@pytest.mark.usefixtures("variant")
+def test_every_face_of_a_box(rng: np.random.Generator) -> None:
+    o, aim = rng.normal(size=(64, 3)), rng.uniform(-0.8, 0.8, (64, 3))
+    o *= 4 / np.linalg.norm(o, axis=1, keepdims=True)
+    d = (aim - o) / np.linalg.norm(aim - o, axis=1, keepdims=True)
+    entered = (-np.sign(d) - o) / d  # distances of the three faces towards the ray
+    face = np.eye(3)[entered.argmax(1)]
+    rays = Rays(
+        *(
+            kind(x.T.astype(np.float32))
+            for kind, x in ((mi.Point3f, o), (mi.Vector3f, d))
+        )
+    )
+    surface = expected_surface(geometry(PosedField(small.homogeneous(1e4))), rays, 0.0)
+    np.testing.assert_allclose(surface.normal.numpy().T, -np.sign(d) * face, atol=1e-6)
+    place = o + entered.max(1)[:, None] * d
+    np.testing.assert_allclose(surface.point.numpy().T, place, atol=0.01)
+
+
+@pytest.mark.usefixtures("variant")
+def test_normals_face_rays_within_what_is_homogeneous(rng: np.random.Generator) -> None:
+    d = small.fan(rng)[1]
+    shape = geometry(PosedField(small.homogeneous(3.0)))
+    surface = expected_surface(shape, Rays(0 * mi.Point3f(d), d), 0.0)
+    np.testing.assert_allclose(surface.normal.numpy(), -d.numpy(), atol=1e-6)
 
 
 @pytest.mark.usefixtures("variant")

@@ -129,6 +129,15 @@ def test_stock_aovs_keep_their_names_and_their_digits(tmp_path, pixels, letters)
     np.testing.assert_allclose(other, distance, rtol=1e-5)
 
 
+def test_seeds_have_32_bits(tmp_path):
+    renderer = FrameRenderer(scenes.write_balls(tmp_path))
+    assert renderer.render(seed=2**32 - 1).metadata["seed"] == "4294967295"
+    for seed in (-1, 2**32):
+        with pytest.raises(InputError) as caught:
+            renderer.render(seed=seed)
+        assert caught.value.where == "seed"
+
+
 def test_aovs_alone_have_no_colour(tmp_path):
     frame = FrameRenderer(scenes.write_balls(tmp_path, aov())).render()
     assert list(frame.channels) == AOV_NAMES

@@ -87,7 +87,8 @@ def test_all_files_that_a_scene_names_are_listed(tmp_path):
     )
     metal = '<bsdf type="conductor"><spectrum name="eta" filename="eta.spd"/></bsdf>'
     body = (
-        '<default name="mesh" value="quad.ply"/><include filename="parts/inner.xml"/>'
+        '<default name="mesh" value="quad.ply"/><default name="all" value="parts"/>'
+        '<include filename="parts/inner.xml"/>'
         '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
         + SHAPE.format("$mesh", metal)
         + SHAPE.format("missing.ply", "").replace("<shape ", '<shape id="none" ')
@@ -121,6 +122,7 @@ CROP = FILM.replace("</film>", '<integer name="crop_width" value="2"/></film>')
         ('<bsdf type="diffuse"><float name="x" value="1"/></bsdf>', {}, '"x"'),
         (FILM, {"parameters": {"width": "3"}}, "width=3.*no <default> of this name"),
         (CROP, {"size_px": (4, 3)}, "crop window"),
+        (FILM + SHAPE.format("/dev/null", ""), {}, "is a pipe or a device"),
     ],
 )
 def test_refusals_are_one_line_with_the_file(tmp_path, body, options, message):
