@@ -5,7 +5,8 @@ each takes. Every change is then made in a copy of the tree, and tests of its li
 there, the quickest first, until one fails or `SECONDS` are over. The table gets a row
 as a change is judged. What has a row is not done again. With ``--again``, changes of
 the table that no test noticed are made in the code of today and judged by tests of all
-lines of their module: coverage counts what is cached for one test alone.
+lines of their module: coverage counts what is cached for one test alone. The column
+`reason` says, written by hand, why a change may live.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def main() -> int:
     rows = _read(given.table)
     code = _hash("")
     if given.again:
-        waiting = _again(rows, code if given.tests is None else "")
+        waiting = _again(rows, None if given.tests else code)
     else:
         drawn = draw(ROOT / PACKAGE, given.parts, given.count, given.seed)
         done = {(*_key(row), row["line"]) for row in rows}
@@ -85,12 +86,12 @@ def main() -> int:
     return 0
 
 
-def _again(rows: list[dict[Any, Any]], code: str) -> list[_Judged]:
+def _again(rows: list[dict[Any, Any]], code: str | None) -> list[_Judged]:
     """Find in the code of today the changes of a table that no test noticed.
 
     Args:
         rows: of the table.
-        code: whose rows need not be judged again.
+        code: whose rows need not be judged again, if any.
     """
     found: list[_Judged] = []
     for row in rows:
@@ -242,13 +243,13 @@ def _read(table: Path) -> list[dict[Any, Any]]:
     if not table.exists():
         return []
     rows = pd.read_csv(table, dtype=str, na_filter=False).to_dict("records")
-    return [{"code": "", **row} for row in rows]
+    return [{"code": "", "reason": "", **row} for row in rows]
 
 
 def _print(rows: list[dict[Any, Any]]) -> None:
     for row in rows:
         if row["outcome"] != "noticed":
-            print(f"{row['path']}:{row['line']} {row['outcome']}")
+            print(f"{row['path']}:{row['line']} {row['outcome']} {row['reason']}")
             print(f"    {row['before']}\n    {row['after']}")
     for part in PARTS:
         own = [row for row in rows if row["path"].startswith(part)]
