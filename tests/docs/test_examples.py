@@ -226,7 +226,7 @@ def test_mistakes_are_told(tmp_path, old, new, end):
 def test_blocks_of_the_guide_to_the_loop_run(tmp_path):
     scripts = blocks("python", "docs/loop.md")
     lines = run(tmp_path, "-c", "\n".join(scripts))
-    assert len(scripts) == 3 and len(lines) == 2
+    assert len(scripts) == 4 and len(lines) == 2
 
 
 @pytest.mark.slow
