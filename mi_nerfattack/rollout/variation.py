@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cache
 from typing import Any
 
 import drjit as dr
@@ -108,11 +107,12 @@ class Varied(AbstractDynamics):
     model: AbstractDynamics
     variation: Variation
     first: int = 0
-    _factors: Any = field(init=False, repr=False, compare=False)
+    _uploaded: dict[Any, list[Any]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "recordable", self.model.recordable)
-        object.__setattr__(self, "_factors", cache(self._uploaded))
 
     @property
     def state_size(self) -> int:
@@ -146,10 +146,10 @@ class Varied(AbstractDynamics):
 
     def constants(self, state: Any) -> list[Any]:
         """See :meth:`AbstractDynamics.constants`."""
-        return self._factors(dr.detached_t(type(state[0])), dr.width(state))
-
-    def _uploaded(self, kind: Any, count: int) -> list[Any]:
-        drawn = self.variation.draws(self.first, count)
-        result = [kind(drawn.speed.tolist()), kind(drawn.steering.tolist())]
-        dr.make_opaque(result)
-        return result
+        key = kind, count = dr.detached_t(type(state[0])), dr.width(state)
+        if key not in self._uploaded:
+            drawn = self.variation.draws(self.first, count)
+            found = [kind(drawn.speed.tolist()), kind(drawn.steering.tolist())]
+            dr.make_opaque(found)
+            self._uploaded[key] = found
+        return self._uploaded[key]
