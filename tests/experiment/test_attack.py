@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import cProfile
 import inspect
+import io
 import json
 import signal
 import subprocess
 import sys
+from contextlib import redirect_stdout
+from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
@@ -29,11 +33,33 @@ from mi_nerfattack.rollout.drive import CASES
 pytestmark = pytest.mark.usefixtures("variant")
 
 
-def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path, capsys):
-    output, scenario = tmp_path / "run", scenario_folder / "scenario.toml"
-    words = ["-o", str(output)]
-    assert cli.main(["attack", str(scenario), *words]) == 0
-    told = " ".join(capsys.readouterr().out.split())
+@dataclass(frozen=True)
+class Finished:
+    """An attack by the command line: its folder, what it told, files it entered."""
+
+    output: Path
+    told: str
+    entered: set[Path]
+
+
+@pytest.fixture(scope="module")
+def finished(scenario_folder, tmp_path_factory) -> Finished:
+    output = tmp_path_factory.mktemp("finished") / "run"
+    path = str(scenario_folder / "scenario.toml")
+    told, profile = io.StringIO(), cProfile.Profile(builtins=False)
+    with redirect_stdout(told), profile:
+        assert cli.main(["attack", path, "-o", str(output), "--workers", "1"]) == 0
+    functions = (entry.code for entry in profile.getstats())
+    entered = {
+        Path(code.co_filename)
+        for code in functions
+        if code.co_flags & inspect.CO_OPTIMIZED  # no module and no class
+    }
+    return Finished(output, " ".join(told.getvalue().split()), entered)
+
+
+def test_attack_writes_a_complete_run_folder(scenario_folder, finished):
+    output, told = finished.output, finished.told
     document = files.read_json(output / "metrics.json")
     validate(document)
     assert_counts(document)
@@ -60,7 +86,8 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path, capsys):
     density = attacked.parameters()["density"].numpy()
     assert np.array_equal(density, original.parameters()["density"].numpy())
     # the text in the run folder replays the scenario
-    again = ["attack", str(output / "scenario.toml"), *words, "--pictures", "none"]
+    words = ["-o", str(output), "--pictures", "none"]
+    again = ["attack", str(output / "scenario.toml"), *words]
     assert cli.main(again) == 0
 
 
@@ -177,22 +204,11 @@ OUTER = ("scenario", "evaluation", "experiment", "report", "commands")
 MOST, MOST_OUTER = 138, 41  # aims: fewer than 130 and 45
 
 
-def test_an_attack_enters_few_files(scenario_folder, tmp_path):
+def test_an_attack_enters_few_files(finished):
     """Which a reader of it must open."""
-    path, entered = scenario_folder / "scenario.toml", set()
-    words = ["attack", str(path), "-o", str(tmp_path / "run"), "--workers", "1"]
-
-    def note(frame, event, _):
-        code = frame.f_code
-        if event == "call" and code.co_flags & inspect.CO_OPTIMIZED:  # a function
-            entered.add(Path(code.co_filename))
-
-    sys.setprofile(note)
-    try:
-        assert cli.main(words) == 0
-    finally:
-        sys.setprofile(None)
-    found = [x for x in entered if x.is_relative_to(ROOT) and x.suffix == ".py"]
+    found = [
+        x for x in finished.entered if x.is_relative_to(ROOT) and x.suffix == ".py"
+    ]
     paths = [path.relative_to(ROOT) for path in found]  # without templates of pages
     ours = [path for path in paths if path.parts[0] in ("mi_nerfattack", "plugins")]
     outer = sorted(str(path) for path in ours if path.parts[1] in OUTER)

@@ -165,8 +165,9 @@ def bricks(tmp_path):
 
 
 def test_iterations_see_bricks_and_drives_the_field(bricks, tmp_path):
-    document = job(bricks, tmp_path / "in_bricks").run(anyway=True)
-    plain = job(bricks, tmp_path / "in_field", NAMED[::-1]).run(anyway=True)
+    document = job(bricks, tmp_path / "in_bricks", frames=None).run(anyway=True)
+    plain = job(bricks, tmp_path / "in_field", NAMED[::-1], frames=None)
+    plain = plain.run(anyway=True)
     [cases], [expected] = (
         [routes["surrogate"] for routes in found["routes"].values()]
         for found in (document, plain)
@@ -200,7 +201,8 @@ def test_iterations_march_one_level_and_drives_all(tmp_path, monkeypatch):
 
         monkeypatch.setattr(OneLevel, "eval", count)
         line = f"method.one_level = {value}\nmethod.max_iterations"
-        run = job(folder, tmp_path / value, ("method.max_iterations", line))
+        change = ("method.max_iterations", line)
+        run = job(folder, tmp_path / value, change, frames=None)
         documents[value] = run.run(anyway=True)
     assert marched["true"] > 0 and marched["false"] == 0
     near, exact = documents["true"], documents["false"]

@@ -47,7 +47,7 @@ def make_dense(folder):
     save_field(folder / "object.safetensors", item)
 
 
-def job(folder, output, change=("", ""), on_progress=None, notices=None):
+def job(folder, output, change=("", ""), on_progress=None, notices=None, **more):
     from mi_nerfattack.experiment.job import Job
     from mi_nerfattack.policy.torch_policy import TorchPolicy
     from mi_nerfattack.scenario.scenario import load_scenario
@@ -60,7 +60,8 @@ def job(folder, output, change=("", ""), on_progress=None, notices=None):
         text = re.sub(r"(?m)^freedom.learning_rate = .*\n", "", text)
     path.write_text(text)
     scenario, text = load_scenario(path)
-    result = Job(scenario, text, TorchPolicy(toy.SmoothPolicy()), output)
+    policy = TorchPolicy(toy.SmoothPolicy())
+    result = Job(scenario, text, policy, output, **more)
     result.on_progress = on_progress or result.on_progress
     result.on_notice = (notices if notices is not None else []).append
     return result
