@@ -33,6 +33,11 @@ class AbstractBackdrop(ABC):
     def has_gradients(self) -> bool:
         """Whether derivatives by its parameters are asked for."""
 
+    def with_gain(self, gain: Any) -> AbstractBackdrop:
+        """Return itself: the light of a backdrop stays as it was captured."""
+        del gain
+        return self
+
     @abstractmethod
     def march(self, rays: Rays, stop: float) -> March:
         """Return what rays show: premultiplied linear radiance, opacity, moment.

@@ -49,7 +49,8 @@ class SceneCamera:
         self.seed: int = seed
         self.centred, self.first = centred, first
         self.variation: Variation | None = variation
-        self._mounts: dict[int, tuple[Any, Any]] = {}
+        self._mounts: dict[int, tuple[Any, Any]] = {}  # by the number of drives
+        self._lights: dict[int, mi.Color3f] = {}
         if centred and math.isqrt(self.spp) ** 2 != self.spp:
             raise InputError(
                 f"samples per pixel: {self.spp}; rays through the middles of squares "
@@ -140,13 +141,15 @@ class SceneCamera:
         """Return factors of the light on objects, (3, n), ray by ray; None for 1."""
         if self.variation is None or not self.variation.of_light:
             return None
-        drawn = self.variation.draws(self.first, count).light
-        light = mi.Color3f(*(mi.Float(channel.tolist()) for channel in drawn))
-        dr.make_opaque(light)
+        if count not in self._lights:
+            drawn = self.variation.draws(self.first, count).light
+            light = mi.Color3f(*(mi.Float(channel.tolist()) for channel in drawn))
+            dr.make_opaque(light)
+            self._lights[count] = light
         width, height = self.size
         rays = width * height * self.spp
         index = dr.arange(mi.UInt32, count * rays) // rays
-        return dr.gather(mi.Color3f, light, index)
+        return dr.gather(mi.Color3f, self._lights[count], index)
 
     def eye(self, pose: Any, count: int) -> mi.Point3f:
         """Return where the eye of each ray of :meth:`rays` is, (3, n)."""
@@ -174,13 +177,10 @@ class SceneCamera:
             return mount.height_m, mount.pitch_deg
         if count not in self._mounts:
             drawn = self.variation.draws(self.first, count)
-            height, pitch = mount.height_m * drawn.height, drawn.pitch_deg
-            found = (
-                mi.Float(height.tolist()),
-                mi.Float((mount.pitch_deg + pitch).tolist()),
-            )
-            dr.make_opaque(found)
-            self._mounts[count] = found
+            height = mi.Float((mount.height_m * drawn.height).tolist())
+            pitch = mi.Float((mount.pitch_deg + drawn.pitch_deg).tolist())
+            dr.make_opaque(height, pitch)
+            self._mounts[count] = height, pitch
         return self._mounts[count]
 
     def _centres(self, total: int) -> mi.Point2f:
@@ -223,7 +223,8 @@ def keyed_sampler(
         count: of rays.
     """
     ray = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
-    state, stream = mi.sample_tea_32(mi.sample_tea_32(step, seed)[0], ray)
+    # the second word: places in pixels are drawn by the first
+    state, stream = mi.sample_tea_32(mi.sample_tea_32(seed, step)[1], ray)
     # with arguments, the constructor would add the index of the ray
     random = mi.PCG32()  # pyright: ignore[reportCallIssue]
     random.seed(mi.UInt64(state), mi.UInt64(stream))

@@ -74,7 +74,7 @@ class ClosedLoop:
         return f"ClosedLoop({names}, goal {self.goal}, periods of {self.dt:g} s)"
 
     def numbered(self, first: int) -> ClosedLoop:
-        """Return this loop with a number of the first drive, of which all draws depend.
+        """Return this loop with a number of the first drive, on which all draws depend.
 
         A drive alone with the number of its row is the same as in the batch.
         """

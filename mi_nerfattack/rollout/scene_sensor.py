@@ -86,7 +86,8 @@ class SceneSensor(AbstractDifferentiableSensor):
             self._collector = self.integrator
         self._parameters = Differentiated(scene, self._collector)
         self.select(params)
-        self.renders: int = 0
+        self._lit: set[int] = set()  # layers whose light varies
+        self._counter = [0]  # shared by copies
 
     def __repr__(self) -> str:
         kind, (width, height) = type(self.integrator).__name__, self.camera.size
@@ -95,33 +96,49 @@ class SceneSensor(AbstractDifferentiableSensor):
     def observe(self, state: Any, step: int) -> Observation:
         """Render a frame; see :meth:`AbstractSensor.observe`."""
         count = dr.width(state)
-        self.renders += count
+        self._counter[0] += count
         # From the state to rays, to their radiance, and to linear pixels
         with dr.suspend_grad():
             sampler, *view = self.camera.rays(pose_of(state), count, step)
             linear, kept = self._render(sampler, view, None)
         return self._observation(linear, kept, view, count, step)
 
+    @property
+    def renders(self) -> int:
+        """Images so far, those of copies with other draws too."""
+        return self._counter[0]
+
     def numbered(self, first: int) -> SceneSensor:
         """See :meth:`AbstractSensor.numbered`; the scene is shared."""
-        return self._with(self.camera.changed(first, self.camera.variation))
+        return self._drawing(first, self.camera.variation)
 
     def varied(self, variation: Variation) -> SceneSensor:
         """Return this sensor with another light and mount in each drive of a batch.
 
-        Raises:
-            InputError: light on objects, and no `field_integrator` that shows them.
-        """
-        if variation.of_light and self._collector is None:
-            raise InputError(
-                f"light: {type(self.integrator).__name__} shows no objects whose light "
-                "could vary; show them by a field_integrator"
-            )
-        return self._with(self.camera.changed(self.camera.first, variation))
+        The light varies on the :attr:`objects` that there are now.
 
-    def _with(self, camera: SceneCamera) -> SceneSensor:
+        Raises:
+            InputError: light on objects, and there are none.
+        """
+        objects = {id(posed) for posed in self.objects}
+        if variation.of_light and not objects:
+            raise InputError(
+                "light: there are no objects whose light could vary; show grid fields "
+                "by a field_integrator, and select their colours"
+            )
+        result = self._drawing(self.camera.first, variation)
+        result._lit = objects
+        return result
+
+    def drawing_as(self, other: SceneSensor) -> SceneSensor:
+        """Return this sensor with the numbers and variation of another one."""
+        camera = other.camera
+        result = self if camera.variation is None else self.varied(camera.variation)
+        return result.numbered(camera.first)
+
+    def _drawing(self, first: int, variation: Variation | None) -> SceneSensor:
         result = copy(self)
-        result.camera = camera
+        result.camera = self.camera.changed(first, variation)
         return result
 
     def keep(self, observation: Observation) -> Any:
@@ -195,7 +212,7 @@ class SceneSensor(AbstractDifferentiableSensor):
         state_in: Any = None,
         gains: Sequence[mi.Color3f] = (),
     ) -> tuple[Any, ...]:
-        more = {"gains": gains} if gains else {}
+        lit = {"gains": gains} if gains else {}
         return self.integrator.sample(
             mode=mode,
             scene=self.scene,
@@ -207,7 +224,7 @@ class SceneSensor(AbstractDifferentiableSensor):
             state_in=state_in,
             active=mi.Bool(True),
             width=self.camera.size[0] * self.camera.spp,
-            **more,
+            **lit,
         )
 
     def _gains(self, rays: int) -> list[mi.Color3f]:
@@ -216,8 +233,8 @@ class SceneSensor(AbstractDifferentiableSensor):
         light = self.camera.light(rays // (width * height * self.camera.spp))
         if light is None:
             return []
-        own = [id(posed) for posed in self.objects]
-        return [light if id(x) in own else mi.Color3f(1) for x in self.layers]
+        plain = mi.Color3f(1)
+        return [light if id(x) in self._lit else plain for x in self.layers]
 
     def _observation(
         self, linear: mi.Color3f, kept: Any, view: Any, count: int, step: int

@@ -29,8 +29,8 @@ class Variation:
         pitch_deg_sd: of the camera's pitch, degrees.
         height_sd: of the logarithm of the camera's height.
         speed_sd: of the logarithm of the vehicle's speed.
-        steering_sd: of the logarithm of its answer to the steering, which stands for
-            a wrong wheelbase and for understeer.
+        steering_sd: of the logarithm of its answer to the steering, as by a wrong
+            wheelbase or by understeer.
         seed: of all draws.
 
     Source: Athalye et al. 2018, expectation over transformation.
@@ -96,7 +96,8 @@ class Draws:
 class Varied(AbstractDynamics):
     """A vehicle whose speed and answer to the steering differ from drive to drive.
 
-    The heading rate of all models but `Dubins` is proportional to the speed.
+    Another speed changes the heading rate in proportion, so that the path stays, but
+    for `Dubins`, whose control is the heading rate. Other rows of a state stay.
 
     Args:
         model: the vehicle.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import NonNegative
 from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.rollout.loop import ClosedLoop
@@ -35,7 +34,7 @@ class VarySection(Section):
             seed: of all draws.
 
         Raises:
-            InputError: the sensor shows no objects whose light could vary.
+            InputError: there are no objects whose light could vary.
         """
         drawn = self.model_dump()
         sizes = ("exposure_ev_sd", "blur_px_sd", "noise_sd", "colour_ev_sd")
@@ -45,10 +44,8 @@ class VarySection(Section):
         variation = Variation(**drawn, seed=seed)
         sensor, dynamics = loop.sensor, loop.dynamics
         if variation.of_light or variation.of_mount:
-            if not isinstance(sensor, SceneSensor):
-                raise InputError(f"attack.vary: {type(sensor).__name__} cannot differ")
+            assert isinstance(sensor, SceneSensor)  # as that of every world
             sensor = sensor.varied(variation)
         if variation.of_vehicle:
             dynamics = Varied(dynamics, variation)
-        more = {"sensor": sensor, "dynamics": dynamics}
-        return replace(loop, disturbance=disturbance, **more)
+        return replace(loop, sensor=sensor, dynamics=dynamics, disturbance=disturbance)

@@ -299,7 +299,7 @@ def build_surrogate(scenario: Scenario) -> SceneSensor:
 def _require_smooth(sensor: SceneSensor, key: str) -> None:
     if (spp := sensor.camera.spp) < SMOOTH_SPP:
         raise InputError(
-            f"attack.attached: {spp} rays per pixel, too few for a smooth objective; "
+            f"attack.attached: rays per pixel: {spp}, too few for a smooth objective; "
             f"set {key} to {SMOOTH_SPP} or more"
         )
 

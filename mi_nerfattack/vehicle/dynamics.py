@@ -147,7 +147,7 @@ class AbstractDynamics(ABC):
         return self
 
     def constants(self, state: Any) -> list[Any]:
-        """Return the arrays that :meth:`derivative` reads beside a state (m, n)."""
+        """Return the arrays that :meth:`derivative` reads besides a state (m, n)."""
         del state
         return []
 

@@ -7,6 +7,7 @@ import pytest
 from support.worlds import loops as toy
 from support.worlds.attacks import ROBUST
 
+from mi_nerfattack.attack.base import distances
 from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.backend.determinism import deterministic
@@ -112,7 +113,9 @@ def test_the_seed_decides_all_that_is_drawn(folder):
         for seed in (4, 4, 5):
             attack, world = attack_of(folder, seed)
             loop = attack.rollout.loop
-            assert loop.disturbance == Disturbance(0.5, 0.8, 0.02, 0.1, seed)
+            assert loop.disturbance == Disturbance(
+                0.5, 0.8, 0.02, seed, colour_ev_sd=0.1
+            )
             assert world.surrogate.camera.seed == seed
             attack.step()
             found.append([attack.tensors()["value.0"], np.array(attack.initial)])
@@ -125,7 +128,13 @@ def test_each_part_changes_the_attack_and_nothing_changes_the_drives(folder):
     gradients = []
     for key in ("", *keys.splitlines()):
         attack, world = attack_of(folder, 1, f"\n{key}\n")
-        assert not world.loop(world.surrogate).disturbance
+        nominal = world.loop(world.surrogate)
+        assert not nominal.disturbance and nominal.dynamics is world.motion.dynamics
+        assert world.surrogate.camera.variation is None
+        seen = attack.rollout.measure(attack.initial)
+        mean = distances(world.route, seen).mean()
+        assert attack.measure_through(world.surrogate) == pytest.approx(mean)
+        assert world.renders == 2 * seen.trajectory.horizon
         attack.step()
         gradients.append(attack.tensors()["first.0"])
     for i, one in enumerate(gradients):

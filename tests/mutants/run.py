@@ -79,6 +79,7 @@ def main() -> int:
                 rows.append(row)
             columns = ("path", "line", "kind", "before", "after")
             row |= {"outcome": outcome, "test": test, "code": code}
+            row["reason"] = row.get("reason", "") * (outcome != "noticed")
             row |= {name: str(getattr(change, name)) for name in columns}
             files.write_text(given.table, pd.DataFrame(rows).to_csv(index=False))
             print(f"{outcome} {change.path}:{change.line}", flush=True)

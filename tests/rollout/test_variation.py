@@ -7,15 +7,20 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 import pytest
+from support.files import objects as made
 from support.worlds import loops as toy
 
 from mi_nerfattack.deploy.surrogate.environment import take_apart
+from mi_nerfattack.deploy.surrogate.scene import field_sensor
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.render.camera.intrinsics import from_fov
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.splatting.background import SplatBackground
 from mi_nerfattack.rollout.loop import ClosedLoop, simulate
 from mi_nerfattack.rollout.scene_sensor import SceneSensor
 from mi_nerfattack.rollout.variation import Variation, Varied
 from mi_nerfattack.vehicle.bicycle import RateLimitedAckermann
-from mi_nerfattack.vehicle.dynamics import Ackermann, Dubins
+from mi_nerfattack.vehicle.dynamics import Ackermann, Dubins, to_state
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -98,11 +103,11 @@ def test_each_drive_has_its_own_vehicle(model):
     variation = Variation(speed_sd=0.2, steering_sd=0.3, seed=3)
     drawn = variation.draws(0, 3)
     rows = model.state_size
-    state = Varied(model, variation)
+    vehicle = Varied(model, variation)
     loop, _ = toy.make_loop()
     start = replace(loop, dynamics=model).initial(POSES)
     control = type(start[0])([0.3, -0.2, 0.1])
-    found = np.array(state.derivative(start, control))
+    found = np.array(vehicle.derivative(start, control))
     for k in range(3):
         own = {"speed": model.speed * drawn.speed[k]}
         if rows > 3 or isinstance(model, Ackermann):
@@ -146,9 +151,30 @@ def test_gradients_are_those_of_the_varied_drives(adjoint):
     assert (found * along).sum() == pytest.approx(difference, rel=0.02)
 
 
-def test_light_without_objects_to_shine_on_is_refused():
+def test_light_falls_on_the_objects_that_there_were():
     loop, plain = varied()
-    plain._collector = None
-    with pytest.raises(InputError, match="field_integrator"):
+    sensor, state = loop.sensor, loop.initial(POSES)
+    before = sensor.observe(state, 0).image.numpy()
+    sensor.select(())
+    assert np.array_equal(sensor.observe(state, 0).image.numpy(), before)
+    assert plain.renders == 6  # of copies, too
+    with pytest.raises(InputError, match="no objects .*field_integrator"):
         plain.varied(ALL)
-    assert plain.varied(Variation(speed_sd=0.1)).camera is not plain.camera
+    assert plain.varied(Variation(pitch_deg_sd=1)).camera is not plain.camera
+
+
+def test_light_leaves_splats_as_they_were_captured():
+    _, item = toy.make_loop()
+    background = SplatBackground(made.splats([12.0, 0.6, 1.0], scales=1.5))
+    posed = PosedField(item, toy.OBJECT_POSE)
+    camera = from_fov(toy.WIDTH, toy.HEIGHT, 70.0)
+    plain = field_sensor(background, [posed], camera, toy.MOUNT)
+    state, light = to_state(POSES), Variation(0.8, 0.5, seed=1)
+    before = plain.observe(state, 0)
+    after = plain.varied(light).observe(state, 0)
+    shown = take_apart(plain, before, dr.zeros(type(before.linear.x), 1))
+    gain = np.repeat(light.draws(0, 3).light, toy.WIDTH * toy.HEIGHT, axis=1)
+    more = (gain - 1) * shown.objects[0].radiance.numpy()
+    expected = before.linear.numpy() + more
+    assert shown.others[0].opacity.numpy().max() > 0.1 and abs(more).max() > 0.05
+    np.testing.assert_allclose(after.linear.numpy(), expected, atol=2e-6)

@@ -88,7 +88,7 @@ def test_keys_and_xml_describe_the_same_sensor(load):
 @pytest.mark.parametrize("changes", [{FIELD: FIELD.replace("1", "4")}, NAMED])
 def test_attached_takes_rays_enough(load, changes):
     add = {"[attack]": "[attack]\nattached = true"}
-    with pytest.raises(InputError, match="rays per pixel, too few.*to 9 or more"):
+    with pytest.raises(InputError, match="rays per pixel: [14], too few.*to 9 or more"):
         build_surrogate(load(changes | add))
     enough = {FIELD: FIELD.replace("1", "9")}
     if changes is not NAMED:

@@ -119,13 +119,14 @@ def showing(
     rule = next(k for k, v in COMPOSITES.items() if type(integrator.composite) is v)
     if integrator.relighting is not None:
         options["relit_samples"] = integrator.relighting.samples
-    return _see(
+    result = _see(
         Shown(others, shown, integrator.behind, {"composite": rule, **options}),
         [camera.sensor, *parts],
         mount=mount or camera.mount,
         seed=camera.seed,
         centred=camera.centred,
     )
+    return result.drawing_as(sensor)
 
 
 def scene_sensor(

@@ -22,7 +22,7 @@ from mi_nerfattack.ranges import NonNegative, Whole, checked
 
 #: Standard deviations at which the blur's kernel ends.
 _TRUNCATE = 4.0
-_STREAM = 3  # of the seed; initial poses have others
+_STREAM, _COLOURS = 3, 7  # of the seed; initial poses have others
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,9 @@ class Disturbance:
         blur_px_sd: of the normal number whose size is the blur's standard deviation.
         noise_sd: standard deviation of the noise, sRGB in [0, 1]; normal, independent
             of pixel, channel and frame.
-        colour_ev_sd: as of the exposure, of each channel by itself: white balance.
         seed: of all draws.
         first: number of the first drive of a batch.
+        colour_ev_sd: as of the exposure, of each channel by itself: white balance.
 
     Source: Athalye et al. 2018, expectation over transformation.
     """
@@ -51,9 +51,9 @@ class Disturbance:
     exposure_ev_sd: NonNegative = 0.0
     blur_px_sd: NonNegative = 0.0
     noise_sd: NonNegative = 0.0
-    colour_ev_sd: NonNegative = 0.0
     seed: Whole = 0
     first: Whole = 0
+    colour_ev_sd: NonNegative = 0.0
 
     def __bool__(self) -> bool:
         """Tell whether it changes anything."""
@@ -64,7 +64,7 @@ class Disturbance:
         """Return exposures (count, 3), powers of two, and blurs (count,), pixels."""
         random = np.random.default_rng([self.seed, _STREAM])
         normal = random.normal(size=(self.first + count, 2))[self.first :]
-        colours = np.random.default_rng([self.seed, _STREAM, 1])
+        colours = np.random.default_rng([self.seed, _COLOURS])
         colours = colours.normal(size=(self.first + count, 3))[self.first :]
         exposures = self.exposure_ev_sd * normal[:, :1] + self.colour_ev_sd * colours
         return exposures, self.blur_px_sd * abs(normal[:, 1])
@@ -80,8 +80,9 @@ class Disturbance:
             a tensor like it; differentiable.
         """
         exposures, blurs = self.draws(image.shape[0])
-        draw = self.noise_sd, self.seed, step, self.first
-        return disturbed(image, exposures, blurs, *draw)
+        return disturbed(
+            image, exposures, blurs, self.noise_sd, self.seed, step, self.first
+        )
 
     def vjp(self, image: Any, step: int, d_shown: Any) -> Any:
         """Return the derivative by the image from the one by what is shown.
