@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Annotated
+
+from pydantic import Field
 
 from mi_nerfattack.ranges import NonNegative
 from mi_nerfattack.render.camera.disturbance import Disturbance
@@ -11,20 +14,23 @@ from mi_nerfattack.rollout.scene_sensor import SceneSensor
 from mi_nerfattack.rollout.variation import Variation, Varied
 from mi_nerfattack.scenario.section import Section
 
+Stops = Annotated[float, Field(ge=0, le=8)]  # powers of two
+Logarithm = Annotated[float, Field(ge=0, le=1)]  # of factors
+
 
 class VarySection(Section):
     """Standard deviations of normal draws, one of each for the drive of a pose."""
 
-    light_ev_sd: NonNegative = 0.0  # of the light on objects, powers of two
-    light_colour_ev_sd: NonNegative = 0.0  # of each channel of it
-    exposure_ev_sd: NonNegative = 0.0  # of the whole image, powers of two
-    colour_ev_sd: NonNegative = 0.0  # of each channel of it
+    light_ev_sd: Stops = 0.0  # of the light on objects, powers of two
+    light_colour_ev_sd: Stops = 0.0  # of each channel of it
+    exposure_ev_sd: Stops = 0.0  # of the whole image, powers of two
+    colour_ev_sd: Stops = 0.0  # of each channel of it
     blur_px_sd: NonNegative = 0.0  # of the number whose size blurs a drive
     noise_sd: NonNegative = 0.0  # of each frame, sRGB in [0, 1]
-    pitch_deg_sd: NonNegative = 0.0  # of the camera
-    height_sd: NonNegative = 0.0  # of the logarithm of its height
-    speed_sd: NonNegative = 0.0  # of the logarithm of the vehicle's speed
-    steering_sd: NonNegative = 0.0  # of the logarithm of its heading rate
+    pitch_deg_sd: Annotated[float, Field(ge=0, le=45)] = 0.0  # of the camera
+    height_sd: Logarithm = 0.0  # of the logarithm of its height
+    speed_sd: Logarithm = 0.0  # of the logarithm of the vehicle's speed
+    steering_sd: Logarithm = 0.0  # of the logarithm of its heading rate
 
     def applied(self, loop: ClosedLoop, seed: int) -> ClosedLoop:
         """Return a loop whose drives differ.

@@ -112,6 +112,8 @@ field = "scene.safetensors" -> => :2: scene.field: is missing; give it, or surro
 field = "scene.safetensors" -> field = "a"; surrogate = "a.xml" => :3: scene.field: .*
 field = "object.safetensors" -> => objects.0.field: is missing
 field = "scene.safetensors" -> field = "a"; spp = 2 => :4: scene.spp: .* 1, 4, 9 or 16
+[attack.vary]; speed_sd = 1.5 => attack.vary.speed_sd: .* 1
+[attack.vary]; light_ev_sd = 9 => attack.vary.light_ev_sd: .* 8
 field = "scene.safetensors" -> surrogate = "a.xml"; spp = 4 => :4: scene.spp: a.xml says
 field = "scene.safetensors" -> surrogate = "a.xml" => :9: objects.0.field: a.xml says it
 """
