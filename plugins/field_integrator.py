@@ -242,18 +242,16 @@ class FieldIntegrator(FilmIntegrator):
     ) -> tuple[Any, mi.Bool, list[mi.Float], Any]:
         """Integrate one ray a lane; see Mitsuba's ``RBIntegrator.sample``.
 
-        Where a film asks for the derivatives of :meth:`splats`, it gives their
-        cotangents as ``δsplats``, and finds their tangents in the place of the state.
-        ``width`` are the rays in a row of an image, where nothing is being recorded.
-        ``gains`` multiply the radiance of the fields, (3, n) each, besides their light.
+        A film gives cotangents of :meth:`splats` as ``δsplats``, and finds tangents in
+        the place of the state. ``width``: rays in a row of an image, if nothing is
+        being recorded. ``gains``: factors of the fields' radiance, (3, n) each.
         """
         del depth, kwargs
         is_primal = mode == dr.ADMode.Primal
         # Inside `moment`, which leaves the derivatives to Dr.Jit
         if is_primal and not width and (leaves := limits.attached(scene)):
-            limits.check_ray(
-                ray, "inside another integrator; take the fields out of it"
-            )
+            where = "inside another integrator; take the fields out of it"
+            limits.check_ray(ray, where)
             call = {"scene": scene, "sampler": sampler, "ray": ray, "active": active}
             return *dr.custom(Sampled, self, call, leaves), None
         attached, ray = ray, mi.Ray3f(dr.detach(ray))

@@ -13,7 +13,6 @@ from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.posed import move_all, offsets_of
 from mi_nerfattack.rollout.function import Evaluation, Rollout
-from mi_nerfattack.rollout.scene_sensor import SceneSensor
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -188,10 +187,8 @@ class AbstractAttack(ABC):
         Returns:
             mean distance from the lane centre, metres.
         """
-        own = self.rollout.loop.sensor
-        if isinstance(sensor, SceneSensor) and isinstance(own, SceneSensor):
-            sensor = sensor.drawing_as(own)
-        loop = replace(self.rollout.loop, sensor=sensor)
+        loop = self.rollout.loop
+        loop = replace(loop, sensor=sensor.drawing_as(loop.sensor))
         closed = replace(self.rollout, loop=loop, camera_path=None)
         seen = closed.measure(self.initial)
         return float(distances(self.route, seen).mean())

@@ -68,6 +68,12 @@ class SceneCamera:
         """Samples per pixel."""
         return self.sensor.sampler().sample_count()
 
+    @property
+    def per_image(self) -> int:
+        """Rays of an image."""
+        width, height = self.size
+        return width * height * self.spp
+
     def rays(
         self, pose: Any, count: int, step: int
     ) -> tuple[mi.Sampler, mi.Ray3f, Any]:
@@ -84,7 +90,7 @@ class SceneCamera:
         width, height = self.size
         sampler, within, aperture = self._draw(count, step)
         # A ray of the scene's own sensor, through a place in its pixel
-        index = dr.arange(mi.UInt32, count * width * height * self.spp) // self.spp
+        index = dr.arange(mi.UInt32, count * self.per_image) // self.spp
         vehicle = index // (width * height)
         pixel = index - vehicle * (width * height)
         row = pixel // width
@@ -114,8 +120,7 @@ class SceneCamera:
 
     def _draw(self, count: int, step: int) -> tuple[mi.Sampler, Any, mi.Point2f]:
         """Return a sampler, places in pixels (2, n) from 0 to 1, and on apertures."""
-        width, height = self.size
-        rays = width * height * self.spp
+        rays = self.per_image
         seed = dr.opaque(mi.UInt32, self.seed), dr.opaque(mi.UInt32, step)
         sampler = keyed_sampler(*seed, self.first * rays, count * rays)
         lens = self.sensor.needs_aperture_sample()
@@ -146,17 +151,12 @@ class SceneCamera:
             light = mi.Color3f(*(mi.Float(channel.tolist()) for channel in drawn))
             dr.make_opaque(light)
             self._lights[count] = light
-        width, height = self.size
-        rays = width * height * self.spp
-        index = dr.arange(mi.UInt32, count * rays) // rays
-        return dr.gather(mi.Color3f, self._lights[count], index)
+        return dr.gather(mi.Color3f, self._lights[count], self._drives(count))
 
     def eye(self, pose: Any, count: int) -> mi.Point3f:
         """Return where the eye of each ray of :meth:`rays` is, (3, n)."""
         origin, _ = self._place(pose)
-        width, height = self.size
-        rays = width * height * self.spp
-        return dr.gather(mi.Point3f, origin, dr.arange(mi.UInt32, count * rays) // rays)
+        return dr.gather(mi.Point3f, origin, self._drives(count))
 
     def nearest(self, distances: mi.Float) -> mi.Float:
         """Return the least of the samples (n spp,) of each pixel."""
@@ -169,6 +169,10 @@ class SceneCamera:
         found = mount_pose(state, height, self.mount.forward_m, pitch)
         dr.eval(found)
         return found
+
+    def _drives(self, count: int) -> mi.UInt32:
+        """Return the row of the batch that each ray belongs to, (n,)."""
+        return dr.arange(mi.UInt32, count * self.per_image) // self.per_image
 
     def _mount(self, count: int) -> tuple[Any, Any]:
         """Return heights, metres, and pitches, degrees: one for all, or of each."""

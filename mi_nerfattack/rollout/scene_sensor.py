@@ -18,7 +18,11 @@ from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.rollout.camera import SceneCamera
 from mi_nerfattack.rollout.parameters import CollectsRays, Differentiated
-from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor, Observation
+from mi_nerfattack.rollout.sensor import (
+    AbstractDifferentiableSensor,
+    AbstractSensor,
+    Observation,
+)
 from mi_nerfattack.rollout.variation import Variation
 
 
@@ -130,8 +134,10 @@ class SceneSensor(AbstractDifferentiableSensor):
         result._lit = objects
         return result
 
-    def drawing_as(self, other: SceneSensor) -> SceneSensor:
-        """Return this sensor with the numbers and variation of another one."""
+    def drawing_as(self, other: AbstractSensor) -> SceneSensor:
+        """See :meth:`AbstractSensor.drawing_as`."""
+        if not isinstance(other, SceneSensor):
+            return self
         camera = other.camera
         result = self if camera.variation is None else self.varied(camera.variation)
         return result.numbered(camera.first)
@@ -229,8 +235,7 @@ class SceneSensor(AbstractDifferentiableSensor):
 
     def _gains(self, rays: int) -> list[mi.Color3f]:
         """Return the variation's factors of all layers, (3, n) each; none for 1."""
-        width, height = self.camera.size
-        light = self.camera.light(rays // (width * height * self.camera.spp))
+        light = self.camera.light(rays // self.camera.per_image)
         if light is None:
             return []
         plain = mi.Color3f(1)

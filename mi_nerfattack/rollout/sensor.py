@@ -58,6 +58,11 @@ class AbstractSensor(ABC):
         del first
         return self
 
+    def drawing_as(self, other: AbstractSensor) -> Self:
+        """Return this sensor with the numbers and the variation of another one."""
+        del other
+        return self
+
 
 class AbstractDifferentiableSensor(AbstractSensor):
     """Sensor whose image can be differentiated by its parameters and by the state.
