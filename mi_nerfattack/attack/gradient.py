@@ -20,7 +20,9 @@ from mi_nerfattack.attack.base import (
     history_tensors,
     read_history,
 )
-from mi_nerfattack.attack.freedom import Freedom, Schedule, offset_gradients
+from mi_nerfattack.attack.freedom import Freedom, offset_gradients
+from mi_nerfattack.attack.gains import least_gain, with_gains
+from mi_nerfattack.attack.plan import Plan, Schedule
 from mi_nerfattack.attack.texture.colours import AbstractColouring, Colours
 from mi_nerfattack.backend.arrays import adam_tensors, load_adam
 from mi_nerfattack.errors import InputError
@@ -30,7 +32,6 @@ from mi_nerfattack.rollout.sweep import Gradient, differentiable
 from mi_nerfattack.vehicle.route.route import Route
 
 OFFSETS = "offsets"
-_WINDOW = 5  # iterations whose predicted and real gains are compared
 
 #: Parameters of the objects' textures, (n, 3) each, by the optimiser's key.
 Parameters = dict[str, np.ndarray]
@@ -40,8 +41,7 @@ class GradientAttack(AbstractAttack):
     """Minimise a cost of the closed loop by its objects' textures and poses.
 
     Holds the parameters, Adam's moments, the history and the best parameters so far;
-    everything is in :meth:`tensors`, so that an interrupted attack can go on. No
-    random numbers are drawn.
+    everything is in :meth:`tensors`, so that an interrupted attack can go on.
 
     Cost of an iteration: one drive forward and one backward; see the adjoint.
 
@@ -50,7 +50,7 @@ class GradientAttack(AbstractAttack):
         route: the lane centre, for the record.
         initial: (m, n) initial states.
         freedom: what may change.
-        schedule: of the learning rates; constant by default.
+        plan: what each iteration does; one start and constant rates by default.
         one_level: march objects as one level while they are optimised, see
             `fields.one_level.OneLevel`.
 
@@ -71,16 +71,17 @@ class GradientAttack(AbstractAttack):
         route: Route,
         initial: Any,
         freedom: Freedom | None = None,
-        schedule: Schedule | None = None,
+        plan: Plan | None = None,
         one_level: bool = False,
     ) -> None:
         freedom = freedom or Freedom()
         super().__init__(rollout, route, initial, freedom, differentiable(rollout.loop))
-        self.schedule: Schedule = schedule or Schedule(sys.maxsize)
+        self.plan: Plan = plan or Plan(Schedule(sys.maxsize))
         self.one_level = one_level
         self.optimiser: Adam = Adam(lr=1.0)
         self.predicted_gains: list[float] = []
         self._colourings: dict[str, AbstractColouring] = {}
+        self._offsets_before = self.best_offsets
         self._best: Parameters = {}  # of the iteration with the least objective
         self._last: IterationRecord | None = None  # what the last update gave
         self._exact: float | None = None  # objective of the best, with all levels
@@ -100,13 +101,13 @@ class GradientAttack(AbstractAttack):
 
     @property
     def is_over(self) -> bool:
-        """Whether the schedule ends here."""
-        return self.schedule.is_over(self._objectives)
+        """Whether the plan ends here."""
+        return self.plan.is_over(self._objectives)
 
     @property
     def has_converged(self) -> bool:
         """Whether there was nothing more to gain at the full rates."""
-        return self.schedule.has_converged(self._objectives)
+        return self.plan.has_converged(self._objectives)
 
     def step(self, on_step: Callable[[int], None] | None = None) -> IterationRecord:
         """Do one iteration.
@@ -117,12 +118,14 @@ class GradientAttack(AbstractAttack):
         Raises:
             InputError: the gradient is not finite; nothing is updated.
         """
+        self._begin()
         moved = self.sensor.pose_keys if self.freedom.pose_rate is not None else ()
         with self._as_one_level():
             self._install()
             evaluation = self.rollout.run(self.initial, on_step)
             record = self._record(evaluation)
-            gradient = self.rollout.gradient(evaluation, moved, on_step=on_step)
+            rollout = self.plan.followed(self.rollout, self._objectives)
+            gradient = rollout.gradient(evaluation, moved, on_step=on_step)
         values = self._values(gradient)
         self.whole = False
         gain = self._update(values)
@@ -130,6 +133,32 @@ class GradientAttack(AbstractAttack):
         self.predicted_gains.append(gain)
         self.whole = True
         return record
+
+    def _begin(self) -> None:
+        """Start from other parameters, or with new moments, where the plan says so."""
+        if self.plan.restarts(self.iteration):
+            values = self._start(self.plan.number(self.iteration))
+        elif self.plan.forgets(self._objectives):
+            values = {key: self._value(key) for key in self.optimiser}
+        else:
+            return
+        self.optimiser = Adam(lr=1.0)
+        for key, value in values.items():
+            self.optimiser[key] = _tensor(value)
+
+    def _start(self, number: int | None) -> Parameters:
+        """Return what a try starts from; None for the best of all tries."""
+        opening = self.plan.opening
+        if number is None or opening is None:
+            values, offsets = dict(self._best), self.best_offsets
+        else:
+            values = {key: c.start for key, c in self._colourings.items()}
+            if (looks := opening.textures(number)) is not None:
+                for key, c in self._colourings.items():
+                    values[key] = c.near(looks[int(key)])
+            drawn = opening.offsets(number)
+            offsets = self._offsets_before if drawn is None else drawn
+        return values | ({OFFSETS: offsets} if OFFSETS in self.optimiser else {})
 
     def finish(self) -> None:
         """See ``AbstractAttack.finish``."""
@@ -171,12 +200,12 @@ class GradientAttack(AbstractAttack):
         return self._textures(self._best)
 
     def rows(self) -> list[dict[str, Any]]:
-        """See ``AbstractAttack.rows``; with the predicted and the real gain."""
-        gains = zip(super().rows(), self.predicted_gains, self._gains, strict=True)
-        return [
-            row | {"predicted_gain": predicted, "gain": float(gain)}
-            for row, predicted, gain in gains
-        ]
+        """See ``AbstractAttack.rows``; with the predicted and the real gain.
+
+        Without those of the opening, which follows other objectives.
+        """
+        rest = self.predicted_gains, self._gains, self.plan.first
+        return with_gains(super().rows(), *rest)
 
     @property
     def least_gain(self) -> dict[str, Any] | None:
@@ -185,21 +214,10 @@ class GradientAttack(AbstractAttack):
         Of an attack that converged, their last fifth, which was to gain nothing, does
         not count.
         """
-        count = self.schedule.full(self._objectives)
+        first, end = self.plan.first, self.plan.full(self._objectives)
         if self.has_converged:
-            count -= count // 5
-        # Five iterations in a row each; of those that predict a fall, the least share
-        gains = self._gains
-        windows = [
-            {
-                "first": first,
-                "predicted": sum(self.predicted_gains[first : first + _WINDOW]),
-                "gain": float(gains[first : first + _WINDOW].sum()),
-            }
-            for first in range(count - _WINDOW + 1)
-        ]
-        falling = [window for window in windows if window["predicted"] > 0]
-        return min(falling, key=lambda w: w["gain"] / w["predicted"], default=None)
+            end -= (end - first) // 5
+        return least_gain(self.predicted_gains, self._gains, first, end)
 
     @property
     def _gains(self) -> np.ndarray:
@@ -263,19 +281,20 @@ class GradientAttack(AbstractAttack):
     def _update(self, gradients: Parameters) -> float:
         """Step; return the gain that the gradients predict."""
         before = {key: self._value(key) for key in gradients}
+        unit = self.plan.unit(list(gradients.values()))
         values = {
             key: self._colourings[key].smoothed(value) if key != OFFSETS else value
             for key, value in gradients.items()
         }
-        share = self.schedule.rate(self._objectives)
+        share = self.plan.rate(self._objectives)
         full = {key: self.freedom.texture_rate or 0.0 for key in values}
         full[OFFSETS] = self.freedom.pose_rate or 0.0
         self.optimiser.set_learning_rate({key: share * full[key] for key in values})
         for key, value in values.items():
-            dr.set_grad(self.optimiser[key], _tensor(value))
+            dr.set_grad(self.optimiser[key], _tensor(value / unit))
         self.optimiser.step()
-        for key, colours in self._colours().items():
-            self.optimiser[key] = _tensor(self._colourings[key].project(colours))
+        for key, value in self._colours().items():
+            self.optimiser[key] = _tensor(self._colourings[key].project(value))
         if OFFSETS in values:
             moved = np.array(dr.detach(self.optimiser[OFFSETS]), np.float64)
             self.optimiser[OFFSETS] = _tensor(self.freedom.project(moved))
@@ -332,17 +351,11 @@ class GradientAttack(AbstractAttack):
         self.restore_best()
 
     def go_on_from(self, tensors: dict[str, np.ndarray]) -> None:
-        """Take over the state of an attack that differed from this one.
+        """See `AbstractAttack.go_on_from`.
 
-        Parameters that it did not change start as they are, those that this one may
-        not change stay as they are. The best ones are not judged yet: call
+        Parameters that the other did not change start as they are, those that this one
+        may not change stay as they are. The best ones are not judged yet: call
         :meth:`judge_best` before the next iteration.
-
-        Args:
-            tensors: its :meth:`tensors`.
-
-        Raises:
-            KeyError: an entry is missing.
         """
         self._read_history(tensors)
         self.best_objective = np.inf

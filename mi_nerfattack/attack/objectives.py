@@ -145,6 +145,23 @@ class CrossTrackDeviation:
 
 
 @dataclass(frozen=True)
+class SideDeviation:
+    """Minus the deviation to one side of the lane centre, ``-s e``.
+
+    Attributes:
+        route: the lane centre.
+        side: s, 1 for the left and -1 for the right.
+    """
+
+    route: Route
+    side: float
+
+    def __call__(self, state: Any) -> Any:
+        """Evaluate at states (m, k): (k,), metres, negative on that side."""
+        return -self.side * self.route.cross_track(state)
+
+
+@dataclass(frozen=True)
 class AbsoluteDeviation:
     """Minus the distance from the lane centre, ``-|e|``.
 

@@ -17,8 +17,10 @@ from mi_nerfattack.attack.black_box.low_frequency import LowFrequency
 from mi_nerfattack.attack.black_box.random_looks import RandomLooks, RandomSearch
 from mi_nerfattack.attack.black_box.search import AbstractSearch
 from mi_nerfattack.attack.black_box.surrogate import SurrogateSearch, textured
-from mi_nerfattack.attack.freedom import Freedom, Schedule
+from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.gradient import GradientAttack
+from mi_nerfattack.attack.opening import AbstractOpening, Restarts, Sides
+from mi_nerfattack.attack.plan import Follow, Plan, Schedule
 from mi_nerfattack.attack.texture.colours import Colours
 from mi_nerfattack.attack.texture.constraints import Constraints
 from mi_nerfattack.attack.texture.gamut import Gamut
@@ -109,14 +111,50 @@ class AbstractGradientMethod(AbstractMethod):
     max_iterations: Count = 48  # fewer where the attack converges before
     final_rate: SomeShare = 0.1  # of the learning rates, at the end
     one_level: bool = False  # march objects as one level meanwhile: faster, not exact
+    opening: Literal["none", "sides", "restarts"] = "none"
+    opening_share: SomeShare = 0.25  # of the iterations, for all tries of the opening
+    follow: Follow = "always"  # in which iterations after it `attached` holds
 
     needs_derivatives = True
 
+    @model_validator(mode="after")
+    def _check_opening(self) -> Any:
+        """Refuse an opening that leaves no iterations, or has none."""
+        count = self.max_iterations
+        if self.opening != "none" and not 0 < self._each * self._tries < count:
+            refuse(
+                "opening_share",
+                f"{self.opening_share:g} of {count} iterations for {self._tries} "
+                "tries; each takes one at least, and one is to be left after them",
+            )
+        return self
+
+    @property
+    def _tries(self) -> int:
+        return {"none": 0, "sides": 2, "restarts": 3}[self.opening]
+
+    @property
+    def _each(self) -> int:
+        return int(self.opening_share * self.max_iterations) // max(self._tries, 1)
+
     def build(self, task: Task) -> AbstractAttack:
         """See :meth:`AbstractMethod.build`."""
-        schedule = Schedule(self.max_iterations, self.final_rate)
-        rest = task.route, task.initial, task.freedom, schedule
+        left = self.max_iterations - self._each * self._tries
+        schedule = Schedule(left, self.final_rate)
+        plan = Plan(schedule, self._opening(task), self.follow)
+        rest = task.route, task.initial, task.freedom, plan
         return GradientAttack(self._rollout(task), *rest, one_level=self.one_level)
+
+    def _opening(self, task: Task) -> AbstractOpening | None:
+        tries = self._each, self._tries
+        if self.opening == "sides":
+            return Sides(*tries, task.route)
+        if self.opening == "restarts":
+            seed = task.seed + (1 << 31)  # other draws than those of the baseline
+            return Restarts(
+                *tries, RandomLooks(task.fields, task.freedom, "blobs", seed)
+            )
+        return None
 
     @abstractmethod
     def _rollout(self, task: Task) -> Rollout:
@@ -365,3 +403,15 @@ class AttackSection(Section):
     vary: VarySection = VarySection()  # between the poses' drives
     checkpoint_every: Count = 10
     deterministic: bool = False  # equal bits from run to run, on one thread
+
+    @model_validator(mode="after")
+    def _check_follow(self) -> Any:
+        """Refuse to follow the camera now and then without ever doing so."""
+        follow = getattr(self.method, "follow", "always")
+        if follow != "always" and not self.attached:
+            refuse(
+                "attached",
+                f"is false, and method.follow is {follow!r}; set attached to true, or "
+                "leave follow out",
+            )
+        return self

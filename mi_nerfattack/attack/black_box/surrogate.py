@@ -14,7 +14,8 @@ from mi_nerfattack.attack.black_box.search import (
     Judged,
     Textures,
 )
-from mi_nerfattack.attack.freedom import Freedom, has_settled
+from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.attack.plan import has_settled
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import ClosedLoop, OnStep

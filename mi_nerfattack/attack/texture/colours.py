@@ -50,6 +50,20 @@ class AbstractColouring(ABC):
             by_texture: (n_vertices, 3), derivative by the texture.
         """
 
+    def near(self, texture: np.ndarray) -> np.ndarray:
+        """Return allowed parameters (n, 3) whose texture looks like another one.
+
+        Args:
+            texture: (n_vertices, 3), raw colours.
+
+        Raises:
+            InputError: there is no way to tell.
+        """
+        raise InputError(
+            f"{type(self).__name__}: has no parameters near a given texture; leave "
+            "out opening 'restarts'"
+        )
+
     def smoothed(self, gradient: np.ndarray) -> np.ndarray:
         """Return the direction (n, 3) that parameters step against."""
         return gradient
@@ -104,6 +118,7 @@ class Colours(AbstractColouring):
         self.level: GridLevel = levels[-1]
         self.extent = field.upper - field.lower
         self.smoothing = smoothing
+        self._field = field
         self._original = field.texture.numpy().copy()
         colours = np.clip(vertex_colours(field, self.level), 1e-4, 1 - 1e-4)
         self._allowed = Allowed(
@@ -131,6 +146,14 @@ class Colours(AbstractColouring):
             for axis in range(3):
                 cube = convolve1d(cube, _BINOMIAL, axis, mode="constant")
         return cube.reshape(gradient.shape)
+
+    def near(self, texture: np.ndarray) -> np.ndarray:
+        """See :meth:`AbstractColouring.near`."""
+        before = self._field.texture.numpy().copy()
+        self._field.set_parameter("texture", texture)
+        colours = vertex_colours(self._field, self.level)
+        self._field.set_parameter("texture", before)
+        return self.project(np.clip(colours, 1e-4, 1 - 1e-4))
 
     def project(self, value: np.ndarray) -> np.ndarray:
         """See :meth:`AbstractColouring.project`."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.worlds import loops as toy
 
-from mi_nerfattack.attack.freedom import Schedule, has_settled
+from mi_nerfattack.attack.plan import Schedule, has_settled
 from mi_nerfattack.attack.texture import statistics
 from mi_nerfattack.attack.texture.colours import Colours, vertex_colours
 from mi_nerfattack.attack.texture.constraints import MARGIN

@@ -1,0 +1,84 @@
+"""How a search by gradient may begin: by tries, of which the best one goes on."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mi_nerfattack.attack.black_box.random_looks import RandomLooks
+from mi_nerfattack.attack.objectives import SideDeviation
+from mi_nerfattack.rollout.function import Rollout
+from mi_nerfattack.rollout.objective import StageSum
+from mi_nerfattack.vehicle.route.route import Route
+
+
+@dataclass(frozen=True)
+class AbstractOpening(ABC):
+    """Tries from several starts.
+
+    All are judged by the attack's own objective.
+
+    Attributes:
+        each: iterations of a try.
+        count: of tries.
+    """
+
+    each: int
+    count: int
+
+    def textures(self, number: int) -> list[np.ndarray] | None:
+        """Return the textures that a try starts from, None: as they were."""
+        del number
+
+    def offsets(self, number: int) -> np.ndarray | None:
+        """Return the offsets (k, 6) that a try starts from, None: as they were."""
+        del number
+
+    @abstractmethod
+    def rollout(self, rollout: Rollout, number: int) -> Rollout:
+        """Return the rollout whose gradient a try follows."""
+
+
+@dataclass(frozen=True)
+class Sides(AbstractOpening):
+    """Two tries from the original, one to the left and one to the right.
+
+    A distance has two directions, and near the lane centre its gradient depends on
+    which side the drive happens to be. Each try follows that of one side.
+
+    Attributes:
+        route: the lane centre.
+    """
+
+    route: Route
+
+    def rollout(self, rollout: Rollout, number: int) -> Rollout:
+        """See :meth:`AbstractOpening.rollout`."""
+        cost = SideDeviation(self.route, 1.0 - 2.0 * number)
+        return replace(rollout, objective=StageSum(cost))
+
+
+@dataclass(frozen=True)
+class Restarts(AbstractOpening):
+    """Tries from random looks; the first from the original.
+
+    Attributes:
+        looks: the draws.
+    """
+
+    looks: RandomLooks
+
+    def textures(self, number: int) -> list[np.ndarray] | None:
+        """See :meth:`AbstractOpening.textures`."""
+        return self.looks.textures(number - 1) if number else None
+
+    def offsets(self, number: int) -> np.ndarray | None:
+        """See :meth:`AbstractOpening.offsets`."""
+        return self.looks.offsets(number - 1) if number else None
+
+    def rollout(self, rollout: Rollout, number: int) -> Rollout:
+        """See :meth:`AbstractOpening.rollout`."""
+        del number
+        return rollout
