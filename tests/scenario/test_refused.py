@@ -25,6 +25,9 @@ name = "test" -> attack.method.max_iterations = 0; name = "a" => :1: attack.meth
 [attack.method]; max_iteratons = 3 => :14: attack.method.max_iteratons: .*max_iterations
 [attack.method]; max_iterations = 0 => method.max_iterations: .*0
 [attack.method]; max_iterations = "3" => method.max_iterations: .*integer
+[attack.method]; opening = "sides"; max_iterations = 7 => method.opening_share: .*7 it
+[attack.method]; opening = "left" => method.opening: .*restarts
+[attack.method]; follow = "in_turns" => attack.attached: .*in_turns
 [[objects]]; scale = -2.0 => :12: objects.1.scale: .*greater.*-2
 [[objects]]; scale = nan => objects.1.scale: .*finite
 position_m = [1.0, 2.0, 0.0] -> => :7: objects.0.position_m: is missing[^\n]*$
