@@ -35,10 +35,11 @@ class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
     Action: `Box` (1,) float32 from -1 to 1, the share of `environment.max_control`, in
     `environment.control_unit`; positive steers to the left.
 
-    Reward: minus the absolute cross-track error in metres after the step. An episode
-    terminates where the vehicle leaves the lane, which is when its side passes the
-    lane's border; it is truncated at the end of the route, after `max_steps` steps, or
-    where the environment has nothing more to observe.
+    Reward: 1 in the lane's centre after the step, falling evenly to 0 where the
+    vehicle's side passes the lane's border, so that a step in the lane is always worth
+    more than none. There the vehicle leaves the lane, and an episode terminates; it is
+    truncated at the end of the route, after `max_steps` steps, or where the environment
+    has nothing more to observe.
 
     `info` holds `cross_track_m`, `arc_length_m`, `state` and, in a reset, `route`.
     Options of `reset`: `route`, the name of one of the routes; `pose`, (3,) x, y and
@@ -123,23 +124,23 @@ class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         """
         self._require_open()
         try:
-            share = np.asarray(action)
+            given = np.asarray(action)
         except (TypeError, ValueError) as error:
             raise InputError(f"action: {action!r}; one control, shape (1,)") from error
-        if share.size != 1:
-            raise InputError(f"action: shape {share.shape}; one control, shape (1,)")
-        if share.dtype.kind not in "iuf":
+        if given.size != 1:
+            raise InputError(f"action: shape {given.shape}; one control, shape (1,)")
+        if given.dtype.kind not in "iuf":
             raise InputError(f"action: {action!r}; a number from -1 to 1")
-        control = float(share.item()) * self.environment.max_control
+        control = float(given.item()) * self.environment.max_control
         frame = self.environment.step(control)
         self._frame, self._steps = frame, self._steps + 1
         info = self._info()
-        error = abs(info["cross_track_m"])
-        departed = error > self._limits[self._route.name]
+        share = abs(info["cross_track_m"]) / self._limits[self._route.name]
+        reward, departed = max(0.0, 1.0 - share), share > 1.0
         over = self._steps >= self.max_steps or self.environment.is_over
         if not self._route.closed:
             over |= info["arc_length_m"] >= self._route.length - self.margin_m
-        return self._observe(frame), -error, departed, over, info
+        return self._observe(frame), reward, departed, over, info
 
     def render(self) -> np.ndarray | None:
         """Return the last image (height, width, 3), sRGB, or None."""

@@ -12,9 +12,12 @@ from support.faults.refusals import refusals
 from support.files.recordings import write_folder
 from support.worlds.places import blank_environment, write_place
 
+from mi_nerfattack.deploy.environment import policy_image
 from mi_nerfattack.deploy.gym import FAR_M, DrivingEnv, make_gym
 from mi_nerfattack.deploy.place import Conditions, Place
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.scenario.scenario import load_scenario
+from mi_nerfattack.scenes import bundled
 from mi_nerfattack.vehicle.route.route import Route
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -52,11 +55,11 @@ def test_gymnasiums_checker_passes(name, place):
         environment.reset()
 
 
-def test_reward_is_the_distance_from_the_lanes_centre():
+def test_reward_falls_from_the_lanes_centre_to_its_border():
     driving = blind()
     driving.reset(seed=0, options={"pose": (2.0, 0.3, 0.0)})
     observation, reward, terminated, truncated, info = driving.step(np.zeros(1))
-    assert reward == pytest.approx(-0.3, abs=1e-6)
+    assert reward == pytest.approx(0.7, abs=1e-6)  # 1 m is left on either side
     assert info["arc_length_m"] == pytest.approx(2.5, abs=1e-6)
     assert not terminated and not truncated
     assert (observation["depth"] == FAR_M).all()
@@ -68,7 +71,10 @@ def test_reward_is_the_distance_from_the_lanes_centre():
     driving.step(np.array([-0.5], np.float32))
     # a share of the largest control, of the car 1.5 rad/s, held for 0.1 s
     assert driving.environment.state[2] == pytest.approx(-0.075, rel=1e-3)
-    assert driving.step(10**2)[1] <= 0  # beyond the largest it saturates
+    driving.step(10**2)  # beyond the largest it saturates
+    assert driving.environment.state[2] == pytest.approx(0.075, rel=1e-3)
+    driving.reset(seed=0, options={"pose": (2.0, 1.2, 0.0)})
+    assert driving.step(np.zeros(1))[1:3] == (0.0, True)  # never below
 
 
 @pytest.mark.parametrize(("offset", "is_out"), [(0.99, False), (1.01, True)])
@@ -112,7 +118,7 @@ def test_a_refused_reset_leaves_the_episode_as_it_was():
     with pytest.raises(InputError, match="pose: "):
         driving.reset(options={"route": "1", "pose": (0.0, np.nan, 0.0)})
     observation, reward, *_ = driving.step(np.zeros(1))
-    assert (observation["goal"], reward) == (0, 0)
+    assert (observation["goal"], reward) == (0, 1)
 
 
 NARROW, WIDE = (Route(str(width), 0, LINE, width) for width in (0.6, 3.5))
@@ -148,3 +154,29 @@ test_what_cannot_be_driven_is_refused = refusals(
     *((step(action), "action: ") for action in NO_NUMBERS),
     (step(np.zeros(2)), r"action: shape \(2,\)"),
 )
+
+
+@pytest.mark.slow
+def test_the_bundled_policy_earns_more_than_crashing():
+    """On the right turn, from its start to its end."""
+    scenario, _ = load_scenario(bundled("base.toml"))
+    policy = scenario.build_policy()
+
+    def episode(steer):
+        driving = make_gym("surrogate", routes=["right"])
+        observation, _ = driving.reset(seed=0)
+        total, ended = 0.0, False
+        while not ended:
+            action = np.array([steer(observation) / driving.environment.max_control])
+            observation, reward, left, over, _ = driving.step(action)
+            total, ended = total + reward, left or over
+        driving.close()
+        return total
+
+    def steered(observation):
+        image, goal = policy_image(observation["image"]), int(observation["goal"])
+        row, _ = policy.step(image, goal, policy.initial_memory(1))
+        return float(np.array(row)[0])
+
+    driven, straight, lock = map(episode, (steered, lambda _: 0.0, lambda _: 9.0))
+    assert driven > 2 * straight > 2 * lock > 0
