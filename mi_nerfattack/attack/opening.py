@@ -9,9 +9,13 @@ import numpy as np
 
 from mi_nerfattack.attack.black_box.random_looks import RandomLooks
 from mi_nerfattack.attack.objectives import SideDeviation
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.objective import StageSum
 from mi_nerfattack.vehicle.route.route import Route
+
+#: Iterations of a try: what its last one would change is not judged.
+FEWEST = 2
 
 
 @dataclass(frozen=True)
@@ -21,12 +25,22 @@ class AbstractOpening(ABC):
     All are judged by the attack's own objective.
 
     Attributes:
-        each: iterations of a try.
+        each: iterations of a try, at least `FEWEST`.
         count: of tries.
+
+    Raises:
+        InputError: a try has too few iterations.
     """
 
     each: int
     count: int
+
+    def __post_init__(self) -> None:
+        if self.each < FEWEST:
+            raise InputError(
+                f"each: {self.each}; a try of fewer than {FEWEST} iterations judges "
+                "nothing but its start"
+            )
 
     def textures(self, number: int) -> list[np.ndarray] | None:
         """Return the textures that a try starts from, None: as they were."""

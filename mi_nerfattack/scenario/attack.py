@@ -19,7 +19,7 @@ from mi_nerfattack.attack.black_box.search import AbstractSearch
 from mi_nerfattack.attack.black_box.surrogate import SurrogateSearch, textured
 from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.gradient import GradientAttack
-from mi_nerfattack.attack.opening import AbstractOpening, Restarts, Sides
+from mi_nerfattack.attack.opening import FEWEST, AbstractOpening, Restarts, Sides
 from mi_nerfattack.attack.plan import Follow, Plan, Schedule
 from mi_nerfattack.attack.texture.colours import Colours
 from mi_nerfattack.attack.texture.constraints import Constraints
@@ -121,11 +121,13 @@ class AbstractGradientMethod(AbstractMethod):
     def _check_opening(self) -> Any:
         """Refuse an opening that leaves no iterations, or has none."""
         count = self.max_iterations
-        if self.opening != "none" and not 0 < self._each * self._tries < count:
+        if self.opening != "none" and not (
+            self._each >= FEWEST and self._each * self._tries < count
+        ):
             refuse(
                 "opening_share",
                 f"{self.opening_share:g} of {count} iterations for {self._tries} "
-                "tries; each takes one at least, and one is to be left after them",
+                f"tries; each takes at least {FEWEST}, and one is to be left over",
             )
         return self
 

@@ -15,6 +15,7 @@ from mi_nerfattack.attack.objectives import CrossTrackDeviation
 from mi_nerfattack.attack.opening import Restarts, Sides
 from mi_nerfattack.attack.plan import Plan, Schedule
 from mi_nerfattack.attack.texture.colours import Colours
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.objective import StageSum
 
@@ -99,11 +100,12 @@ def test_restarts_begin_with_the_original_and_then_with_random_looks(parts):
     field = parts[2]
     original = toy.texture_of(field)
     looks = RandomLooks([field], Freedom(0.1), "blobs", 5)
-    attack = attack_of(parts, Plan(Schedule(2), Restarts(1, 3, looks)))
+    attack = attack_of(parts, Plan(Schedule(2), Restarts(2, 3, looks)))
     seen = []
     for _ in range(3):
         attack._begin()
         seen.append(texture_now(attack))
+        attack.step()
         attack.step()
     np.testing.assert_allclose(seen[0], original, atol=1e-5)
     colours = Colours(field)
@@ -115,6 +117,11 @@ def test_restarts_begin_with_the_original_and_then_with_random_looks(parts):
     assert np.abs(seen[1] - seen[2]).max() > 0.1
     best = min(record.objective for record in attack.history)
     assert attack.step().objective == pytest.approx(best, abs=1e-6)
+
+
+def test_a_try_of_one_iteration_is_refused():
+    with pytest.raises(InputError, match="each: 1; .*fewer than 2"):
+        Sides(1, 2, toy.ROUTE)
 
 
 def test_colours_near_a_texture_look_like_it(parts):
