@@ -21,7 +21,7 @@ from bench.attack.drive import (
 )
 from bench.render.cameras import STOP
 from bench.worker import Clock
-from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.attack.base import Freedom
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.attack.objectives import CrossTrackDeviation
 from mi_nerfattack.backend.determinism import one_thread

@@ -14,14 +14,14 @@ from drjit.opt import Adam
 
 from mi_nerfattack.attack.base import (
     AbstractAttack,
+    Freedom,
     IterationRecord,
     best_so_far,
     distances,
     history_tensors,
+    offset_gradients,
     read_history,
 )
-from mi_nerfattack.attack.freedom import Freedom, offset_gradients
-from mi_nerfattack.attack.gains import least_gain, with_gains
 from mi_nerfattack.attack.plan import Plan, Schedule
 from mi_nerfattack.attack.texture.colours import AbstractColouring, Colours
 from mi_nerfattack.backend.arrays import adam_tensors, load_adam
@@ -82,6 +82,7 @@ class GradientAttack(AbstractAttack):
         self.predicted_gains: list[float] = []
         self._colourings: dict[str, AbstractColouring] = {}
         self._offsets_before = self.best_offsets
+        self._depended = np.zeros(len(self.sensor.objects), bool)
         self._best: Parameters = {}  # of the iteration with the least objective
         self._last: IterationRecord | None = None  # what the last update gave
         self._exact: float | None = None  # objective of the best, with all levels
@@ -136,9 +137,9 @@ class GradientAttack(AbstractAttack):
 
     def _begin(self) -> None:
         """Start from other parameters, or with new moments, where the plan says so."""
-        if self.plan.restarts(self.iteration):
-            values = self._start(self.plan.number(self.iteration))
-        elif self.plan.forgets(self._objectives):
+        if self.plan.starts_over(self.iteration):
+            values = self._start(self.plan.try_index(self.iteration))
+        elif self.plan.resets_moments(self._objectives):
             values = {key: self._value(key) for key in self.optimiser}
         else:
             return
@@ -202,10 +203,14 @@ class GradientAttack(AbstractAttack):
     def rows(self) -> list[dict[str, Any]]:
         """See ``AbstractAttack.rows``; with the predicted and the real gain.
 
-        Without those of the opening, which follows other objectives.
+        Without those of the opening, whose tries end before they are judged.
         """
-        rest = self.predicted_gains, self._gains, self.plan.first
-        return with_gains(super().rows(), *rest)
+        rows = super().rows()
+        gains = zip(self.predicted_gains, self._gains.tolist(), strict=True)
+        for k, (row, pair) in enumerate(zip(rows, gains, strict=True)):
+            told = pair if k >= self.plan.tried else (None, None)
+            row["predicted_gain"], row["gain"] = told
+        return rows
 
     @property
     def least_gain(self) -> dict[str, Any] | None:
@@ -214,10 +219,8 @@ class GradientAttack(AbstractAttack):
         Of an attack that converged, their last fifth, which was to gain nothing, does
         not count.
         """
-        first, end = self.plan.first, self.plan.full(self._objectives)
-        if self.has_converged:
-            end -= (end - first) // 5
-        return least_gain(self.predicted_gains, self._gains, first, end)
+        gains = self.predicted_gains, self._gains
+        return self.plan.least_gain(self._objectives, *gains)
 
     @property
     def _gains(self) -> np.ndarray:
@@ -228,17 +231,7 @@ class GradientAttack(AbstractAttack):
     @property
     def without_gradient(self) -> list[int]:
         """See ``AbstractAttack.without_gradient``."""
-        if not self.history:
-            return []
-        found = np.zeros(len(self.sensor.objects), bool)
-        tensors = adam_tensors(self.optimiser)
-        for key in self.optimiser:
-            moment = tensors[f"first.{key}"]  # of all gradients so far
-            if key == OFFSETS:
-                found |= moment.any(axis=1)
-            else:
-                found[int(key)] |= moment.any()
-        return np.flatnonzero(~found).tolist()
+        return np.flatnonzero(~self._depended).tolist() if self.history else []
 
     def judge_best(self, on_step: Callable[[int], None] | None = None) -> None:
         """See `AbstractAttack.judge_best`."""
@@ -280,8 +273,13 @@ class GradientAttack(AbstractAttack):
 
     def _update(self, gradients: Parameters) -> float:
         """Step; return the gain that the gradients predict."""
+        for key, value in gradients.items():
+            if key == OFFSETS:
+                self._depended |= value.any(axis=1)
+            else:
+                self._depended[int(key)] |= value.any()
         before = {key: self._value(key) for key in gradients}
-        unit = self.plan.unit(list(gradients.values()))
+        scale = self.plan.gradient_scale(list(gradients.values()))
         values = {
             key: self._colourings[key].smoothed(value) if key != OFFSETS else value
             for key, value in gradients.items()
@@ -291,7 +289,7 @@ class GradientAttack(AbstractAttack):
         full[OFFSETS] = self.freedom.pose_rate or 0.0
         self.optimiser.set_learning_rate({key: share * full[key] for key in values})
         for key, value in values.items():
-            dr.set_grad(self.optimiser[key], _tensor(value / unit))
+            dr.set_grad(self.optimiser[key], _tensor(value / scale))
         self.optimiser.step()
         for key, value in self._colours().items():
             self.optimiser[key] = _tensor(self._colourings[key].project(value))
@@ -329,6 +327,7 @@ class GradientAttack(AbstractAttack):
         return {
             **history_tensors(self.history),
             "predicted_gains": np.array(self.predicted_gains, np.float64),
+            "depended": self._depended.astype(np.uint8),
             **adam_tensors(self.optimiser),
             **{f"best.{key}": best for key, best in self._best.items()},
             "best_mean_m": np.array([self.best_mean_m]),
@@ -374,6 +373,7 @@ class GradientAttack(AbstractAttack):
         if len(gains) != len(history):
             raise InputError(f"{len(history)} iterations, {len(gains)} predicted gains")
         self.history, self.predicted_gains = history, gains
+        self._depended = np.array(tensors["depended"], bool)
 
     def _record(
         self, seen: Evaluation, colours: Parameters | None = None

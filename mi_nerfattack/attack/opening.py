@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -25,15 +26,16 @@ class AbstractOpening(ABC):
     All are judged by the attack's own objective.
 
     Attributes:
-        each: iterations of a try, at least `FEWEST`.
         count: of tries.
+        each: iterations of a try, at least `FEWEST`.
 
     Raises:
         InputError: a try has too few iterations.
     """
 
+    count: ClassVar[int]
+
     each: int
-    count: int
 
     def __post_init__(self) -> None:
         if self.each < FEWEST:
@@ -66,21 +68,25 @@ class Sides(AbstractOpening):
         route: the lane centre.
     """
 
+    count = 2
+
     route: Route
 
     def rollout(self, rollout: Rollout, number: int) -> Rollout:
         """See :meth:`AbstractOpening.rollout`."""
-        cost = SideDeviation(self.route, 1.0 - 2.0 * number)
+        cost = SideDeviation(self.route, -1.0 if number else 1.0)
         return replace(rollout, objective=StageSum(cost))
 
 
 @dataclass(frozen=True)
 class Restarts(AbstractOpening):
-    """Tries from random looks; the first from the original.
+    """Three tries, the first from the original, the others from random looks.
 
     Attributes:
         looks: the draws.
     """
+
+    count = 3
 
     looks: RandomLooks
 

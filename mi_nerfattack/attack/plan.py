@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -116,6 +116,8 @@ def _fall(turn: int) -> int:
 #: In which iterations after the opening attached images are differentiated.
 Follow = Literal["always", "second_half", "in_turns"]
 
+_WINDOW = 5  # iterations whose predicted and real gains are compared
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -128,9 +130,9 @@ class Plan:
         schedule: of the learning rates, after the opening. With "second_half" each
             half has one of its own, and only the second one's rates fall.
         opening: from where to try first; None for one start.
-        follow: where the rollout is attached, in which iterations it is: `"always"`;
-            in the `"second_half"` after the opening, or once the first has settled;
-            `"in_turns"`, in every other iteration after the opening.
+        follow: where the rollout is attached, in which iterations it is: `"always"`,
+            in tries too; in the `"second_half"` after the opening, or once the first
+            has settled; `"in_turns"`, in every other iteration after the opening.
     """
 
     schedule: Schedule
@@ -138,25 +140,29 @@ class Plan:
     follow: Follow = "always"
 
     @property
-    def first(self) -> int:
+    def tried(self) -> int:
         """Number of iterations of the opening."""
         return self.opening.count * self.opening.each if self.opening else 0
 
-    def number(self, done: int) -> int | None:
-        """Return which try the next iteration belongs to; None after the opening."""
-        return done // self.opening.each if self.opening and done < self.first else None
+    def try_index(self, done: int) -> int | None:
+        """Return which try the next iteration belongs to; None after the opening.
 
-    def restarts(self, done: int) -> bool:
+        Args:
+            done: number of iterations that are done.
+        """
+        return done // self.opening.each if self.opening and done < self.tried else None
+
+    def starts_over(self, done: int) -> bool:
         """Whether the next iteration starts from other parameters than the last left.
 
         Args:
             done: number of iterations that are done.
         """
-        if self.opening is None or done > self.first:
+        if self.opening is None or done > self.tried:
             return False
         return done % self.opening.each == 0
 
-    def forgets(self, objectives: Sequence[float]) -> bool:
+    def resets_moments(self, objectives: Sequence[float]) -> bool:
         """Whether the next iteration's gradient is of another kind than all before.
 
         Args:
@@ -174,16 +180,16 @@ class Plan:
         """
         done = len(objectives)
         if self.follow == "in_turns":
-            attached = done > self.first and (done - self.first) % 2 == 1
+            attached = done > self.tried and (done - self.tried) % 2 == 1
         else:
             attached = self.follow == "always" or self._last(objectives) is not None
         rollout = replace(rollout, attached=rollout.attached and attached)
-        number = self.number(done)
-        if self.opening is None or number is None:
+        index = self.try_index(done)
+        if self.opening is None or index is None:
             return rollout
-        return self.opening.rollout(rollout, number)
+        return self.opening.rollout(rollout, index)
 
-    def unit(self, gradients: Sequence[np.ndarray]) -> float:
+    def gradient_scale(self, gradients: Sequence[np.ndarray]) -> float:
         """Return what gradients are divided by before Adam takes them.
 
         In turns, it is their root mean square: attached and detached ones differ in
@@ -199,38 +205,96 @@ class Plan:
         last = self._last(objectives)
         if last is None:
             return 1.0
-        return self._schedule(last).rate(objectives[last:])
+        return self._schedule(last).rate(_part(objectives, last))
 
     def is_over(self, objectives: Sequence[float]) -> bool:
         """Whether to stop, see :meth:`Schedule.is_over`."""
         last = self._last(objectives)
-        return last is not None and self._schedule(last).is_over(objectives[last:])
+        if last is None:
+            return False
+        return self._schedule(last).is_over(_part(objectives, last))
 
     def has_converged(self, objectives: Sequence[float]) -> bool:
         """Whether nothing was left to gain, see :meth:`Schedule.has_converged`."""
         last = self._last(objectives)
         if last is None:
             return False
-        return self._schedule(last).has_converged(objectives[last:])
+        return self._schedule(last).has_converged(_part(objectives, last))
 
-    def full(self, objectives: Sequence[float]) -> int:
-        """Return how many iterations had the full rates, those of the opening too."""
-        last = self._last(objectives)
-        if last is None:
-            return len(objectives)
-        return last + self._schedule(last).full(objectives[last:])
+    def steady(self, objectives: Sequence[float]) -> list[range]:
+        """Return the iterations that were to gain something, at the full rates.
+
+        After the opening; of a part that settled, without its last fifth.
+
+        Args:
+            objectives: of the iterations that are done.
+        """
+        last, done = self._last(objectives), len(objectives)
+        ends = [(self.tried, done if last is None else last, last is not None)]
+        if last is not None:
+            schedule, part = self._schedule(last), _part(objectives, last)
+            settled = schedule.has_converged(part)
+            ends.append((last, last + schedule.full(part), settled))
+        parts = []
+        for start, end, settled in ends:
+            cut = settled and has_settled(_part(objectives[:end], start))
+            parts.append(range(start, end - (end - start) // 5 * cut))
+        return parts
+
+    def least_gain(
+        self,
+        objectives: Sequence[float],
+        predicted: Sequence[float],
+        gains: np.ndarray,
+    ) -> dict[str, Any] | None:
+        """Find five iterations in a row that gave the least of the predicted gain.
+
+        Of those that add up to a predicted fall of the objective.
+
+        Args:
+            objectives: of all iterations.
+            predicted: gain by the gradient, of each.
+            gains: real ones, (n,).
+
+        Returns:
+            see `AbstractAttack.least_gain`.
+        """
+        windows = [
+            {
+                "first": start,
+                "predicted": sum(predicted[start : start + _WINDOW]),
+                "gain": float(gains[start : start + _WINDOW].sum()),
+            }
+            for part in self.steady(objectives)
+            for start in range(part.start, part.stop - _WINDOW + 1)
+        ]
+        falling = [window for window in windows if window["predicted"] > 0]
+        return min(falling, key=lambda w: w["gain"] / w["predicted"], default=None)
 
     def _last(self, objectives: Sequence[float]) -> int | None:
         """Return where the part whose rates fall begins; None before."""
         done = len(objectives)
-        turn = self.first
+        turn = self.tried
         if self.follow == "second_half":
             half = self.schedule.max_iterations // 2
-            settled = np.flatnonzero(_settled_after(objectives[turn : turn + half]))
+            first = _part(objectives[: turn + half], turn)
+            settled = np.flatnonzero(_settled_after(first))
             turn += int(settled[0]) if len(settled) else half
         return turn if done >= turn else None
 
     def _schedule(self, last: int) -> Schedule:
         """Return the schedule of the part that begins there."""
-        left = self.schedule.max_iterations - (last - self.first)
+        left = self.schedule.max_iterations - (last - self.tried)
         return Schedule(left, self.schedule.final_rate)
+
+
+def _part(objectives: Sequence[float], start: int) -> Sequence[float]:
+    """Return the objectives from an iteration on, as a schedule looks at them.
+
+    They are the least so far, and the first of them is the attack's very first, so
+    that what earlier parts gained counts as gain.
+    """
+    if len(objectives) <= start:
+        return []
+    least = np.minimum.accumulate(objectives)
+    return [float(objectives[0]), *least[start + 1 :].tolist()]

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from mi_nerfattack.attack.base import AbstractAttack
+from mi_nerfattack.attack.base import AbstractAttack, Freedom
 from mi_nerfattack.attack.black_box.blocks import BlockSearch
 from mi_nerfattack.attack.black_box.low_frequency import LowFrequency
 from mi_nerfattack.attack.black_box.random_looks import RandomLooks, RandomSearch
 from mi_nerfattack.attack.black_box.search import AbstractSearch
-from mi_nerfattack.attack.black_box.surrogate import SurrogateSearch, textured
-from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.attack.black_box.surrogate import SurrogateSearch, Task
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.attack.opening import FEWEST, AbstractOpening, Restarts, Sides
 from mi_nerfattack.attack.plan import Follow, Plan, Schedule
@@ -44,38 +43,8 @@ from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.scenario.named_file import File
 from mi_nerfattack.scenario.section import Kinds, Section, refuse
 from mi_nerfattack.scenario.vary import VarySection
-from mi_nerfattack.vehicle.route.route import Route
 
 Population = Annotated[int, Field(ge=2)]
-
-
-@dataclass(frozen=True, eq=False)
-class Task:
-    """What an attack is made for.
-
-    Attributes:
-        rollout: the loop, its objective and its adjoint.
-        route: the lane centre.
-        initial: (m, n) that it starts from.
-        freedom: what may change.
-        seed: of the scenario.
-    """
-
-    rollout: Rollout
-    route: Route
-    initial: Any
-    freedom: Freedom
-    seed: int
-
-    @property
-    def fields(self) -> Sequence[GridField]:
-        """Of the objects."""
-        return textured(self.rollout.loop).fields
-
-    @property
-    def frames(self) -> int:
-        """Frames of the drives of one judgement."""
-        return self.rollout.horizon * len(self.initial[0])
 
 
 class AbstractMethod(Section):
@@ -113,7 +82,7 @@ class AbstractGradientMethod(AbstractMethod):
     one_level: bool = False  # march objects as one level meanwhile: faster, not exact
     opening: Literal["none", "sides", "restarts"] = "none"
     opening_share: SomeShare = 0.25  # of the iterations, for all tries of the opening
-    follow: Follow = "always"  # in which iterations after it `attached` holds
+    follow: Follow = "always"  # iterations after it in which attack.attached holds
 
     needs_derivatives = True
 
@@ -133,7 +102,8 @@ class AbstractGradientMethod(AbstractMethod):
 
     @property
     def _tries(self) -> int:
-        return {"none": 0, "sides": 2, "restarts": 3}[self.opening]
+        kinds = {"sides": Sides, "restarts": Restarts}
+        return kinds[self.opening].count if self.opening in kinds else 0
 
     @property
     def _each(self) -> int:
@@ -143,19 +113,22 @@ class AbstractGradientMethod(AbstractMethod):
         """See :meth:`AbstractMethod.build`."""
         left = self.max_iterations - self._each * self._tries
         schedule = Schedule(left, self.final_rate)
-        plan = Plan(schedule, self._opening(task), self.follow)
-        rest = task.route, task.initial, task.freedom, plan
-        return GradientAttack(self._rollout(task), *rest, one_level=self.one_level)
+        return GradientAttack(
+            self._rollout(task),
+            task.route,
+            task.initial,
+            task.freedom,
+            Plan(schedule, self._opening(task), self.follow),
+            one_level=self.one_level,
+        )
 
     def _opening(self, task: Task) -> AbstractOpening | None:
-        tries = self._each, self._tries
         if self.opening == "sides":
-            return Sides(*tries, task.route)
+            return Sides(self._each, task.route)
         if self.opening == "restarts":
             seed = task.seed + (1 << 31)  # other draws than those of the baseline
-            return Restarts(
-                *tries, RandomLooks(task.fields, task.freedom, "blobs", seed)
-            )
+            looks = RandomLooks(task.fields, task.freedom, "blobs", seed)
+            return Restarts(self._each, looks)
         return None
 
     @abstractmethod
@@ -408,12 +381,19 @@ class AttackSection(Section):
 
     @model_validator(mode="after")
     def _check_follow(self) -> Any:
-        """Refuse to follow the camera now and then without ever doing so."""
-        follow = getattr(self.method, "follow", "always")
-        if follow != "always" and not self.attached:
+        """Refuse to follow the camera along a path, or only when told otherwise."""
+        method = self.method
+        if self.attached and method.kind in ("open_loop", "single_frame"):
             refuse(
                 "attached",
-                f"is false, and method.follow is {follow!r}; set attached to true, or "
-                "leave follow out",
+                f"is true; the images of {method.kind} do not follow the vehicle, set "
+                "attached to false",
             )
+        if isinstance(method, AbstractGradientMethod) and method.follow != "always":
+            if not self.attached:
+                refuse(
+                    "attached",
+                    f"is false, and method.follow is {method.follow!r}; set attached "
+                    "to true, or leave follow out",
+                )
         return self

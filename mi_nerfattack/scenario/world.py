@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from mi_nerfattack.attack.base import AbstractAttack
+from mi_nerfattack.attack.black_box.surrogate import Task
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.place import Place
 from mi_nerfattack.deploy.registry import kinematic_vehicle
@@ -33,7 +34,6 @@ from mi_nerfattack.rollout.loop import ClosedLoop
 from mi_nerfattack.rollout.objective import AbstractObjective
 from mi_nerfattack.rollout.scene_sensor import SceneSensor
 from mi_nerfattack.rollout.sensor import AbstractSensor
-from mi_nerfattack.scenario.attack import Task
 from mi_nerfattack.scenario.deployment import SURROGATE, Deployment, deployments
 from mi_nerfattack.scenario.scenario import SMOOTH_SPP, Scenario, SceneSection
 from mi_nerfattack.scenario.vary import VarySection

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from support.worlds import loops as toy
 
-from mi_nerfattack.attack.base import best_so_far
-from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.attack.base import Freedom, best_so_far
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.attack.objectives import (
     AbsoluteDeviation,

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from support.worlds import loops as toy
 
+from mi_nerfattack.attack.base import Freedom
 from mi_nerfattack.attack.black_box.random_looks import RandomLooks
-from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.attack.black_box.surrogate import Task
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.attack.objectives import CrossTrackDeviation
 from mi_nerfattack.attack.opening import Restarts, Sides
@@ -18,11 +19,14 @@ from mi_nerfattack.attack.texture.colours import Colours
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.objective import StageSum
+from mi_nerfattack.scenario.attack import GradientMethod
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 HORIZON = 6
-SIDES = Sides(2, 2, toy.ROUTE)
+SIDES = Sides(2, toy.ROUTE)
+HALVES = Plan(Schedule(40, 0.1), follow="second_half")
+OPENED = Plan(Schedule(38, 0.1), Sides(5, toy.ROUTE))
 
 
 @pytest.fixture
@@ -59,7 +63,7 @@ def test_each_try_goes_to_its_side_and_the_best_goes_on(parts):
         attack.step()
         attack._install()
         sides.append(mean_signed(attack) - before)
-        assert attack.plan.number(attack.iteration - 1) == number
+        assert attack.plan.try_index(attack.iteration - 1) == number
     assert sides[0] > 0.001 and sides[1] < -0.001
     objectives = [record.objective for record in attack.history]
     assert objectives[0] == objectives[2]  # both begin with the original
@@ -100,7 +104,7 @@ def test_restarts_begin_with_the_original_and_then_with_random_looks(parts):
     field = parts[2]
     original = toy.texture_of(field)
     looks = RandomLooks([field], Freedom(0.1), "blobs", 5)
-    attack = attack_of(parts, Plan(Schedule(2), Restarts(2, 3, looks)))
+    attack = attack_of(parts, Plan(Schedule(2), Restarts(2, looks)))
     seen = []
     for _ in range(3):
         attack._begin()
@@ -121,7 +125,7 @@ def test_restarts_begin_with_the_original_and_then_with_random_looks(parts):
 
 def test_a_try_of_one_iteration_is_refused():
     with pytest.raises(InputError, match="each: 1; .*fewer than 2"):
-        Sides(1, 2, toy.ROUTE)
+        Sides(1, toy.ROUTE)
 
 
 def test_colours_near_a_texture_look_like_it(parts):
@@ -138,6 +142,19 @@ def test_colours_near_a_texture_look_like_it(parts):
     inside = [cube[:-1, :-1, :-1] for cube in cubes]  # the last vertices lie beyond
     np.testing.assert_allclose(*inside, atol=1e-4)
     np.testing.assert_array_equal(toy.texture_of(field), before)
+
+
+@pytest.mark.parametrize(
+    ("opening", "count", "tried"),
+    [("none", 8, 0), ("sides", 17, 4), ("restarts", 24, 6)],
+)
+def test_tries_are_part_of_the_iterations(parts, opening, count, tried):
+    rollout, initial, _ = parts
+    task = Task(rollout, toy.ROUTE, initial, Freedom(0.1), 3)
+    method = GradientMethod(opening=opening, max_iterations=count)
+    plan = method.build(task).plan
+    assert plan.tried == tried
+    assert plan.schedule.max_iterations == count - tried
 
 
 @pytest.mark.parametrize(
@@ -159,15 +176,22 @@ def test_when_the_gradient_follows_the_camera(parts, follow, expected):
 
 def test_the_second_half_begins_once_the_first_has_settled():
     """Ten iterations gain 1 in all, the last two of them nothing."""
-    plan = Plan(Schedule(40, 0.1), follow="second_half")
-    objectives = [-1.0, *[-2.0] * 9, *[-2.5] * 10]
-    assert [k for k in range(21) if plan.forgets(objectives[:k])] == [10]
+    plan = HALVES
+    objectives = [-1.0, *[-2.0] * 9, -2.0, *[-2.0 - 0.1 * k for k in range(9)]]
+    assert [k for k in range(21) if plan.resets_moments(objectives[:k])] == [10]
     assert plan.rate(objectives[:10]) == plan.rate(objectives[:20]) == 1.0
     assert not plan.has_converged(objectives[:10])
-    assert plan.full(objectives[:10]) == 10
-    settled = objectives[:10] + [-2.0, *[-3.0] * 9]
-    assert plan.rate(settled) < 1 and plan.has_converged(settled)
-    assert plan.is_over([*settled, *[-3.0] * 3])
+    assert plan.steady(objectives) == [range(8), range(10, 20)]
+
+
+@pytest.mark.parametrize("plan", [HALVES, OPENED])
+def test_a_part_that_gains_nothing_more_has_converged(plan):
+    """The gain of the parts before counts, and what they found."""
+    objectives = [-1.0, *[-2.0] * 9, -1.5, *[-2.0] * 9]
+    assert not plan.has_converged(objectives[:19])
+    assert plan.has_converged(objectives) and plan.rate(objectives) < 1
+    assert plan.is_over([*objectives, *[-2.0] * 3])
+    assert plan.steady(objectives)[-1] == range(10, 18)
 
 
 def test_its_moments_are_forgotten(parts):
@@ -183,9 +207,22 @@ def test_its_moments_are_forgotten(parts):
     assert steps[2] == pytest.approx(steps[0], rel=1e-3)
 
 
+def test_what_mattered_in_a_try_is_not_forgotten(parts):
+    attack = attack_of(parts, Plan(Schedule(3), SIDES))
+    attack.step()
+    attack.step()
+    kept = attack.tensors()
+    assert attack.without_gradient == []
+    attack._begin()  # of the second try
+    assert attack.without_gradient == []
+    again = attack_of(parts, Plan(Schedule(3), SIDES))
+    again.load_tensors(kept | {"depended": np.zeros(1, np.uint8)})
+    assert again.without_gradient == [0]
+
+
 def test_in_turns_gradients_have_one_size():
     plan = Plan(Schedule(4), follow="in_turns")
     values = [np.full((2, 3), 3.0), np.full((2, 3), 4.0)]
-    assert plan.unit(values) == pytest.approx(np.sqrt(12.5))
-    assert plan.unit([np.zeros((2, 3))]) == 1.0
-    assert Plan(Schedule(4)).unit(values) == 1.0
+    assert plan.gradient_scale(values) == pytest.approx(np.sqrt(12.5))
+    assert plan.gradient_scale([np.zeros((2, 3))]) == 1.0
+    assert Plan(Schedule(4)).gradient_scale(values) == 1.0

@@ -16,7 +16,7 @@ from support.worlds.cameras import block
 from support.worlds.fields import homogeneous
 
 from mi_nerfattack import cli
-from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.attack.base import Freedom
 from mi_nerfattack.deploy.environment import CameraFrame
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment import job as module

@@ -7,8 +7,7 @@ import pytest
 from support.worlds import loops as toy
 from support.worlds.attacks import ROBUST
 
-from mi_nerfattack.attack.base import distances
-from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.attack.base import Freedom, distances
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.backend.determinism import deterministic
 from mi_nerfattack.errors import InputError

@@ -11,7 +11,7 @@ import pytest
 from support.reference.derivatives import central_difference
 from support.worlds import loops as toy
 
-from mi_nerfattack.attack.freedom import Freedom, offset_gradients
+from mi_nerfattack.attack.base import Freedom, offset_gradients
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.attack.texture.colours import AbstractColouring
 from mi_nerfattack.backend.determinism import deterministic

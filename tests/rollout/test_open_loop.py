@@ -10,8 +10,7 @@ import pytest
 from support.worlds import loops as toy
 from support.worlds.loops import ADJOINTS
 
-from mi_nerfattack.attack.base import IterationRecord, distances
-from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.attack.base import Freedom, IterationRecord, distances
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.attack.objectives import CrossTrackDeviation
 from mi_nerfattack.attack.plan import Plan, Schedule
@@ -157,7 +156,7 @@ def test_the_least_gain_is_of_iterations_that_predict_a_fall(closed):
     attack.predicted_gains.append(0.5)  # whose gain is not known yet: 0
     assert attack.least_gain == {"first": 4, "predicted": 0.5, "gain": -1.5}
     attack.plan = Plan(Schedule(12))  # whose rates fall after nine iterations
-    assert attack.plan.full(list(objectives)) == 9
+    assert attack.plan.schedule.full(list(objectives)) == 9
     attack.plan = Plan(Schedule(10))  # after eight
     assert attack.least_gain == {"first": 3, "predicted": 1.0, "gain": -0.5}
     attack.plan = Plan(Schedule(5))  # after four, which are too few

@@ -23,7 +23,7 @@ from support.worlds.loops import (
     unit,
 )
 
-from mi_nerfattack.attack.freedom import offset_gradients
+from mi_nerfattack.attack.base import offset_gradients
 from mi_nerfattack.deploy.surrogate.scene import field_sensor, showing
 from mi_nerfattack.render import composite, rays
 from mi_nerfattack.render.camera.disturbance import Disturbance

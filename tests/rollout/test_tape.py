@@ -13,7 +13,7 @@ from support.worlds import loops as toy
 from support.worlds.fields import empty_border
 from support.worlds.loops import OFFSET
 
-from mi_nerfattack.attack.freedom import offset_gradients
+from mi_nerfattack.attack.base import offset_gradients
 from mi_nerfattack.deploy.surrogate.scene import field_sensor
 from mi_nerfattack.fields import GridLayout
 from mi_nerfattack.render.camera.pose import Pose

@@ -27,6 +27,7 @@ name = "test" -> attack.method.max_iterations = 0; name = "a" => :1: attack.meth
 [attack.method]; max_iterations = "3" => method.max_iterations: .*integer
 [attack.method]; opening = "sides"; max_iterations = 15 => opening_share: .*least 2
 [attack.method]; opening = "left" => method.opening: .*restarts
+[attack.method]; kind = "open_loop"; [attack]; attached = true => attached: .*open_l
 [attack.method]; follow = "in_turns" => attack.attached: .*in_turns
 [[objects]]; scale = -2.0 => :12: objects.1.scale: .*greater.*-2
 [[objects]]; scale = nan => objects.1.scale: .*finite

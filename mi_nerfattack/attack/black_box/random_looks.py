@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mi_nerfattack.attack.base import Freedom
 from mi_nerfattack.attack.black_box.search import AbstractSearch, Proposal
-from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.random_textures import random_texture

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from mi_nerfattack.attack.base import AbstractAttack, IterationRecord, distances
+from mi_nerfattack.attack.base import (
+    AbstractAttack,
+    Freedom,
+    IterationRecord,
+    distances,
+)
 from mi_nerfattack.attack.black_box.search import (
     AbstractSearch,
     BlackBoxAttack,
     Judged,
     Textures,
 )
-from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.plan import has_settled
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import ClosedLoop, OnStep
 from mi_nerfattack.rollout.scene_sensor import SceneSensor
@@ -141,3 +147,32 @@ def textured(loop: ClosedLoop) -> SceneSensor:
     if not isinstance(loop.sensor, SceneSensor):
         raise InputError(f"{type(loop.sensor).__name__}: has no textures to change")
     return loop.sensor
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What an attack is made for.
+
+    Attributes:
+        rollout: the loop, its objective and its adjoint.
+        route: the lane centre.
+        initial: (m, n) that it starts from.
+        freedom: what may change.
+        seed: of the scenario.
+    """
+
+    rollout: Rollout
+    route: Route
+    initial: Any
+    freedom: Freedom
+    seed: int
+
+    @property
+    def fields(self) -> Sequence[GridField]:
+        """Of the objects."""
+        return textured(self.rollout.loop).fields
+
+    @property
+    def frames(self) -> int:
+        """Frames of the drives of one judgement."""
+        return self.rollout.horizon * len(self.initial[0])

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.attack.base import Freedom
 from mi_nerfattack.backend.arrays import upload_rows
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.vehicle.route.route import Route

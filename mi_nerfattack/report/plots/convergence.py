@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,7 +19,7 @@ _DASHES = ("-", "--", "-.", ":")
 
 def convergence(
     path: str | Path,
-    history: Sequence[Mapping[str, float]],
+    history: Sequence[Mapping[str, Any]],
     curve: Mapping[str, Sequence[float]] | None = None,
 ) -> None:
     """Plot an attack's objective, mean error and gains against its cost.
@@ -27,7 +28,7 @@ def convergence(
         path: PNG file.
         history: one mapping per iteration with the keys `objective` and
             `cross_track_mean_m`; iterations count from 0. Of a gradient, `gain` and
-            `predicted_gain`, too.
+            `predicted_gain`, too, None in tries.
         curve: `frames` and the same keys, of the best so far; of the first iterations,
             one after the other, and what came after them. None: drawn by iterations.
     """
@@ -58,14 +59,19 @@ def convergence(
 
 
 def _draw_gains(
-    axis: Axes, at: np.ndarray, history: Sequence[Mapping[str, float]]
+    axis: Axes, at: np.ndarray, history: Sequence[Mapping[str, Any]]
 ) -> None:
     """Draw the gain that the gradient predicted of each iteration, and the real one."""
     for key, label, color in (
         ("predicted_gain", "predicted by the gradient", PALETTE[2]),
         ("gain", "real", ORANGE),
     ):
-        axis.plot(at, [entry[key] for entry in history], color=color, label=label)
+        axis.plot(
+            at,
+            np.array([entry[key] for entry in history], float),
+            color=color,
+            label=label,
+        )
     axis.set_yscale("symlog", linthresh=0.1)
     axis.set_ylabel("gain")
     axis.grid(alpha=0.25)

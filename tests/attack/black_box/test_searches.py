@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.worlds import loops as toy
 
+from mi_nerfattack.attack.base import Freedom
 from mi_nerfattack.attack.black_box import (
     BayesianSearch,
     BlackBoxAttack,
@@ -20,7 +21,6 @@ from mi_nerfattack.attack.black_box import (
 )
 from mi_nerfattack.attack.black_box.low_frequency import lattice
 from mi_nerfattack.attack.black_box.random_looks import RandomLooks, equal_count, judge
-from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.texture.colours import Colours, vertex_colours
 from mi_nerfattack.attack.texture.constraints import Constraints
 from mi_nerfattack.errors import InputError

@@ -19,7 +19,7 @@ from support.worlds.places import (
     surroundings,
 )
 
-from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.attack.base import Freedom
 from mi_nerfattack.deploy.roadside.footprint import Shape, Stands
 from mi_nerfattack.deploy.roadside.rule import Roadside
 from mi_nerfattack.deploy.roadside.surroundings import Surroundings
