@@ -29,10 +29,12 @@ from mi_nerfattack.rollout.drive import OWN, Drive, departure_limit
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import World
 from mi_nerfattack.vehicle.dynamics import to_state
+from mi_nerfattack.vehicle.route.route import Route
 
 #: Share by which depths of surrogate and deployment may differ in the middle.
 DEPTHS = 0.15
 
+_SPEEDS = 0.01  # share by which the speeds of route and vehicle may differ
 _STANDING_M = 0.5  # what is higher above z = 0 is no ground
 _FARTHEST_M = 80.0
 _FEWEST = 100  # pixels, of which something is said
@@ -164,6 +166,26 @@ def departure_findings(world: World, drives: list[Drive]) -> Iterator[str]:
         f"{worst.distance_m.max():.2f} m from the lane's centre, and beyond "
         f"{limit:.2f} m after {worst.time_s[step]:.1f} s at ({x:.1f}, {y:.1f}) m; give "
         "a policy that keeps it, or another route, start or object"
+    )
+
+
+def speed_findings(world: World) -> Iterator[str]:
+    """Tell of a vehicle that is faster or slower than the routes file says."""
+    scenario, dynamics = world.scenario, world.motion.dynamics
+    scene, drive, period = scenario.scene, scenario.drive, scenario.vehicle.dt_s
+    route = Route.from_file(scene.routes.file, scene.route)
+    state = to_state(dynamics.extend(world.initial[:1]))
+    velocity = dynamics.derivative(state, type(state[0])(0)).numpy()[:2]
+    speed = float(np.linalg.norm(velocity))
+    if np.isclose(speed, route.speed_ms, rtol=_SPEEDS):
+        return
+    horizon, expected = world.horizon, drive.steps(route, period)
+    yield (
+        f"the vehicle starts at {speed:.3g} m/s, and {scene.routes} gives route "
+        f"{route.name!r} {route.speed_ms:.3g} m/s: a drive has {horizon} control "
+        f"periods and about {horizon * speed * period:.1f} m, and at the route's speed "
+        f"{expected} control periods and {expected * route.speed_ms * period:.1f} m; "
+        "give both the same speed, unless you want the difference"
     )
 
 

@@ -32,6 +32,7 @@ from mi_nerfattack.experiment.checks.before_attack import (
     mesh_scene,
     place_findings,
     route_findings,
+    speed_findings,
 )
 from mi_nerfattack.experiment.checks.cost import Cost, estimate
 from mi_nerfattack.render.camera.intrinsics import from_fov, mount_matrix
@@ -80,6 +81,7 @@ class Check:
         """
         world = self.world
         departure_limit(world.route.lane_width_m, world.scenario.vehicle.width_m)
+        self.doubts += speed_findings(world)
         try:
             if drives:
                 self._told(self._drive)
