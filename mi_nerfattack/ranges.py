@@ -34,6 +34,9 @@ Name = Annotated[str, Field(min_length=1, description="a name, not empty")]
 ControlUnit = Annotated[
     str, Field(pattern="^rad(/s)?$", description="'rad/s' or 'rad'")
 ]
+CarUnit = Annotated[
+    str, Field(pattern="^(rad(/s)?|other)$", description="'rad/s', 'rad' or 'other'")
+]
 
 _T = TypeVar("_T")
 _STRICT = ConfigDict(extra="forbid", strict=True)

@@ -152,8 +152,12 @@ class Evaluate:
             motion = file.vehicle.motion()
             routes = tuple(at_own_speed(route, motion) for route in routes)
             settings = replace(settings, car_width_m=place.car.width)
+        vehicle = file.vehicle
+        taken = place.car.control_unit if vehicle is None else vehicle.unit
+        if misfit := section.misfit(taken):
+            raise InputError(f"policy: the car of the place {misfit}")
         check_policy(section.build(), place, routes)
-        store, vehicle = Store(self.drives), file.vehicle
+        store = Store(self.drives)
         return EvaluateDrives(store, section, place, under, routes, settings, vehicle)
 
     def _settings(self, place: Place, is_own: bool) -> EvaluateSettings:

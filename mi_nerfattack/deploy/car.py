@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.ranges import Acute, ControlUnit, Positive, checked
+from mi_nerfattack.ranges import Acute, CarUnit, Positive, checked
 from mi_nerfattack.render.camera.intrinsics import CameraMount
 
 
@@ -22,8 +22,8 @@ class Car:
         wheel_radius: metres.
         mass: kilograms.
         max_steer: largest steering angle, radians, below pi / 2.
-        control_unit: of the control that a policy gives: "rad/s" of a heading rate, or
-            "rad" of a steering angle.
+        control_unit: of the control that a policy gives: "rad/s" of a heading rate,
+            "rad" of a steering angle, "other" of what drives no car with wheels.
         max_control: largest control that has an effect, in that unit; of a steering
             angle at most `max_steer`.
     """
@@ -35,7 +35,7 @@ class Car:
     wheel_radius: Positive = 0.32
     mass: Positive = 1400.0
     max_steer: Acute = 0.75
-    control_unit: ControlUnit = "rad/s"
+    control_unit: CarUnit = "rad/s"
     max_control: Positive = 1.5
 
     def __post_init__(self) -> None:

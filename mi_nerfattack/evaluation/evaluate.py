@@ -237,7 +237,8 @@ def make_card(
 
     Returns:
         {ENVIRONMENT: {ROUTE: {CASE: figures}}} of JSON types, in the order of the
-        drives; the figures are those of `card_figures`.
+        drives; the figures are those of `card_figures`, and those without objects
+        have the expert's as `expert`, None where it does not drive.
     """
     card: dict[str, Any] = {}
     for (label, route, case), group in drives.items():
@@ -245,10 +246,10 @@ def make_card(
             continue
         figures = card_figures(group, limits[route])
         expert = drives.get((label, route, EXPERT))
-        if case == NO_OBJECT and expert is not None:
-            seen = card_figures(expert, limits[route])
+        if case == NO_OBJECT:
+            seen = card_figures(expert, limits[route]) if expert else None
             names = ("n", "cross_track_mean_m", "cross_track_max_m", "drives_departed")
-            figures["expert"] = {name: seen[name] for name in names}
+            figures["expert"] = seen and {name: seen[name] for name in names}
         card.setdefault(label, {}).setdefault(route, {})[case] = figures
     return card
 

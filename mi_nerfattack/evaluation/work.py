@@ -32,8 +32,6 @@ from mi_nerfattack.evaluation.identity import EnvironmentUnder, identify
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.io import files
 from mi_nerfattack.policy.base import AbstractPolicy
-from mi_nerfattack.policy.pilotnet import PilotNet
-from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.camera.intrinsics import from_fov
 from mi_nerfattack.rollout.drive import EXPERT, NO_OBJECT, Drive, departure_limits
 from mi_nerfattack.rollout.loop import OnStep
@@ -82,6 +80,11 @@ class EvaluateDrives(AbstractDrives):
         """Names of the cases; without objects there is one."""
         return self.settings.cases if self.place.objects else (NO_OBJECT,)
 
+    @property
+    def has_expert(self) -> bool:
+        """Whether an expert drives, too; none knows some of the user's vehicles."""
+        return self.vehicle is None or self.vehicle.has_expert
+
     @cached_property
     def groups(self) -> Sequence[Sequence[DriveSpec]]:
         """Every drive; those of one environment and of one sort together."""
@@ -90,7 +93,7 @@ class EvaluateDrives(AbstractDrives):
         return [
             [self._spec(under, route, case, run, identities[under.label, route.name])]
             for under in self.environments
-            for sort in ((EXPERT,), self.cases)
+            for sort in ((EXPERT,) if self.has_expert else (), self.cases)
             for route in self.routes
             for case in sort
             for run in range(self.settings.runs)
@@ -300,16 +303,8 @@ def check_policy(policy: AbstractPolicy, place: Place, routes: Sequence[Route]) 
     """Show a policy a black image for every goal.
 
     Raises:
-        InputError: the camera's image or a goal does not fit, or PilotNet's unit is
-            not the car's.
+        InputError: the camera's image or a goal does not fit.
     """
-    if isinstance(policy, TorchPolicy) and isinstance(policy.module, PilotNet):
-        given, taken = policy.module.unit, place.car.control_unit
-        if given != taken and policy.control_scale == 1:
-            raise InputError(
-                f"policy: gives {given}, the car of the place takes {taken}; evaluate "
-                "a policy of this car, or set policy.control_scale"
-            )
     shape = (1, place.camera.height, place.camera.width, 3)
     image = mi.TensorXf(np.zeros(shape, np.float32))
     for route in routes:

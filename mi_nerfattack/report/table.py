@@ -6,6 +6,7 @@ A run has ``metrics.json``, a sweep ``summary.json``, a transfer a whole
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -110,10 +111,20 @@ def card_table(card: Document) -> Table:
     figures = [
         *(Column("runs", "n"), *_FIGURES),
         Column("departed", "drives_departed", short="drives\ndeparted"),
-        Column("expert (m)", "expert.cross_track_mean_m", short="expert\n(m)"),
+        Column("expert (m)", "{expert_m:.3f}", short="expert\n(m)"),
     ]
-    rows = list(cells(card, "environment", "route", "case"))
-    return Table(_TITLE, [_ENVIRONMENT, _ROUTE, _CASE], figures, rows)
+    return Table(_TITLE, [_ENVIRONMENT, _ROUTE, _CASE], figures, list(card_rows(card)))
+
+
+def card_rows(card: Document) -> Iterator[dict[str, Any]]:
+    """Yield the figures of each cell of a card, with its names and `expert_m`.
+
+    The mean error of the expert, metres, is NaN where no expert drives, and None in
+    cases with objects.
+    """
+    for cell in cells(card, "environment", "route", "case"):
+        expert = cell.get("expert", {"cross_track_mean_m": None})
+        yield {**cell, "expert_m": expert["cross_track_mean_m"] if expert else math.nan}
 
 
 def transfer_table(document: Document) -> Table:

@@ -43,7 +43,14 @@ from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.policy.weights import load_drjit_state, load_state
 from mi_nerfattack.ranges import Count, Finite, Positive, Whole
 from mi_nerfattack.scenario.named_file import Code, File
-from mi_nerfattack.scenario.section import Kinds, Section, Trust, read_section, refuse
+from mi_nerfattack.scenario.section import (
+    Kinds,
+    Section,
+    Trust,
+    Unit,
+    read_section,
+    refuse,
+)
 from mi_nerfattack.scenario.user_code import check_trust
 
 COLOURS: dict[str, Callable[[], AbstractTransform]] = {
@@ -114,6 +121,8 @@ class AbstractPolicySection(Section):
     """What describes every policy."""
 
     control_scale: NonZero = 1.0  # to rad/s (dubins) or rad, positive to the left
+    #: After `control_scale`; results do not depend on this key.
+    control_unit: Annotated[Unit | None, Field(exclude=True)] = None
     output: Whole | None = None  # column of the control, where there are several
     preprocess: PreprocessSection = PreprocessSection()
     trust_code: Trust = False  # of files that are code: they run with all rights
@@ -122,6 +131,24 @@ class AbstractPolicySection(Section):
     def source(self) -> str:
         """The file or URL, as it is given."""
         return next(str(v) for (key, *_), v in self.leaves() if key in ("file", "url"))
+
+    def unit(self) -> str | None:
+        """Return the unit of the control; None where nothing says it."""
+        return self.control_unit
+
+    def misfit(self, taken: str | None) -> str:
+        """Say why a vehicle does not take the control; nothing if it may.
+
+        Args:
+            taken: unit of the vehicle's control; None where nothing says it.
+        """
+        given = self.unit()
+        if None in (given, taken) or given == taken:
+            return ""
+        return (
+            f"takes {taken}, and {self.source} gives {given}; take another of them, or "
+            "convert the control by policy.control_scale"
+        )
 
     @abstractmethod
     def build(self) -> AbstractPolicy:
@@ -190,8 +217,18 @@ class PilotNetSection(AbstractNetworkSection):
     kind: Literal["pilotnet"] = "pilotnet"
 
     def unit(self) -> str | None:
-        """Return the unit of the control; None if it is converted or unknown."""
+        """Return the unit in the file, or in the key."""
+        return self._stored_unit() or self.control_unit
+
+    def _stored_unit(self) -> str | None:
+        """Return the unit in the file; None if it is converted or unknown."""
         return stored_unit(self.file.file) if self.control_scale == 1 else None
+
+    @model_validator(mode="after")
+    def _check_unit(self) -> Any:
+        if self.control_unit and self._stored_unit() not in (None, self.control_unit):
+            refuse("control_unit", f"{self.source} says it in its file; leave it out")
+        return self
 
     def build(self) -> AbstractPolicy:
         """Load the network."""

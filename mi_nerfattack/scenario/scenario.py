@@ -34,11 +34,7 @@ from mi_nerfattack.scenario.deployment import (
 )
 from mi_nerfattack.scenario.named_file import File, NamedFile, portable_text
 from mi_nerfattack.scenario.objective import ObjectiveSection
-from mi_nerfattack.scenario.policy import (
-    PilotNetSection,
-    PolicySection,
-    build_differentiable,
-)
+from mi_nerfattack.scenario.policy import PolicySection, build_differentiable
 from mi_nerfattack.scenario.section import (
     CameraSection,
     Section,
@@ -52,7 +48,6 @@ from mi_nerfattack.vehicle.route.route import Route
 
 #: Returns the name of a file without its folder, and the SHA-256 of its content.
 Content = Callable[[NamedFile], dict[str, str]]
-STEERED = ("ackermann", "ackermann_rate", "bicycle")
 _MAX_CHARACTERS = 1 << 16
 _LAYER = re.compile(r"scene\d*|background|cost|input")  # of frames, beside objects'
 
@@ -270,11 +265,8 @@ class Scenario(Section):
                         f"{label}: {kind} drives a car with wheels, whose control is "
                         "not that of a custom vehicle; take mitsuba",
                     )
-        if isinstance(self.policy, PilotNetSection) and model != "custom":
-            given, taken = self.policy.unit(), "rad" if model in STEERED else "rad/s"
-            if given not in (None, taken):
-                told = f"takes {taken}, and {self.policy.source} gives {given}"
-                refuse("vehicle.kind", f"{model} {told}; take another of them")
+        if misfit := self.policy.misfit(self.vehicle.unit):
+            refuse("vehicle.kind", f"{model} {misfit}")
         return self
 
     def _check_placed(self) -> None:

@@ -12,7 +12,15 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, is_dataclass, replace
 from inspect import signature
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NoReturn, get_args, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    NoReturn,
+    get_args,
+    get_type_hints,
+)
 
 import tomlkit
 from pydantic import (
@@ -43,6 +51,8 @@ from mi_nerfattack.ranges import Count, Finite, Positive
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
 
 Trust = Annotated[bool, Field(exclude=True)]  # results do not depend on it
+#: Of a control: a heading rate, a steering angle, or another quantity.
+Unit = Literal["rad/s", "rad", "other"]
 
 #: Keys and indices that lead to a value of the file.
 Location = tuple[str | int, ...]

@@ -14,7 +14,7 @@ from mi_nerfattack.deploy.car import CAR, Car
 from mi_nerfattack.deploy.vehicle import Motion
 from mi_nerfattack.ranges import Count, Finite, Positive, Whole
 from mi_nerfattack.scenario.named_file import AnyCode
-from mi_nerfattack.scenario.section import Kinds, Section, Trust, refuse
+from mi_nerfattack.scenario.section import Kinds, Section, Trust, Unit, refuse
 from mi_nerfattack.vehicle.bicycle import KinematicBicycle, RateLimitedAckermann
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics, Ackermann, Dubins, to_state
 from mi_nerfattack.vehicle.integrators import (
@@ -73,6 +73,16 @@ class AbstractVehicleSection(Section):
         sizes = {name: size * getattr(CAR, name) for name in names}
         sizes |= {"width": self.width_m, "mass": CAR.mass * size**3}
         return replace(CAR, **{**sizes, **self._handling()})
+
+    @property
+    def unit(self) -> str | None:
+        """Unit of the control; None where a custom vehicle does not say it."""
+        return self.car().control_unit
+
+    @property
+    def has_expert(self) -> bool:
+        """Whether an expert knows what the control does."""
+        return self.unit in ("rad/s", "rad")
 
     @abstractmethod
     def _handling(self) -> dict[str, Any]:
@@ -180,6 +190,9 @@ class CustomSection(AbstractVehicleSection):
     state_size: Annotated[int, Field(ge=3, le=16)] = 3
     control_limit: Positive  # in the unit of the function's control
     rest_state: tuple[Finite, ...] = ()  # initial values of the rows after theta
+    #: Drives do not depend on these two, only the expert that `evaluate` compares with.
+    control_unit: Annotated[Unit | None, Field(exclude=True)] = None
+    wheelbase_m: Annotated[Positive | None, Field(exclude=True)] = None
 
     @model_validator(mode="after")
     def _check_rest(self) -> Any:
@@ -191,6 +204,21 @@ class CustomSection(AbstractVehicleSection):
                 f"{self.state_size} needs {self.state_size - 3} or none",
             )
         return self
+
+    @model_validator(mode="after")
+    def _check_unit(self) -> Any:
+        """Refuse a steering angle of which no heading rate follows."""
+        if self.control_unit == "rad":
+            if self.wheelbase_m is None:
+                refuse("wheelbase_m", 'is missing; control_unit = "rad" needs it')
+            if self.control_limit >= math.pi / 2:
+                refuse("control_limit", "is no steering angle; must be below pi / 2")
+        return self
+
+    @property
+    def unit(self) -> str | None:
+        """What the key says."""
+        return self.control_unit
 
     def build(self) -> AbstractDynamics:
         """Load the function, and try it near the origin and the initial state."""
@@ -210,7 +238,11 @@ class CustomSection(AbstractVehicleSection):
         return dynamics
 
     def _handling(self) -> dict[str, Any]:
-        return {"max_control": self.control_limit}
+        limit, wheelbase = self.control_limit, self.wheelbase_m
+        steered = {"max_steer": limit} if self.control_unit == "rad" else {}
+        sizes = {} if wheelbase is None else {"wheelbase": wheelbase}
+        unit = self.control_unit or "other"
+        return {"max_control": limit, "control_unit": unit, **steered, **sizes}
 
 
 def _steered(wheelbase: float, max_steer_deg: float) -> dict[str, Any]:

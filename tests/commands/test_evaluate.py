@@ -205,6 +205,67 @@ def test_a_toml_file_brings_camera_and_vehicle_of_its_policy(
         cli.main([*place, "--horizon", "3", "--runs", "1"])
 
 
+CUSTOM = """\
+kind = "custom"
+function = "car.py:car"
+trust_code = true
+control_limit = 0.5
+width_m = 1.5
+"""
+CAR = """\
+import drjit as dr
+
+def car(state, control):
+    theta = state[2]
+    return 5 * dr.cos(theta), 5 * dr.sin(theta), 5 / 2 * dr.tan(control)
+"""
+
+
+@pytest.mark.parametrize(
+    ("unit", "has_expert"),
+    [
+        ("", False),
+        ('control_unit = "other"', False),
+        ('control_unit = "rad"\nwheelbase_m = 2.0', True),
+    ],
+)
+def test_no_expert_drives_a_vehicle_whose_control_nobody_knows(
+    place, monkeypatch, capsys, unit, has_expert
+):
+    """An expert that knows it drives as it drives the same car of another kind."""
+    monkeypatch.setattr(evaluate_work, "make_environment", make_environment)
+    Path("car.py").write_text(CAR)
+    Path("turn.py").write_text("def drive(image, *_):\n    return [0.02]\n")
+    steer = float(np.degrees(0.5))
+    known = (
+        f'kind = "ackermann"\nwheelbase_m = 2\nmax_steer_deg = {steer!r}\nwidth_m = 1.5'
+    )
+    cards = []
+    for name, vehicle in (("known", known), ("mine", f"{CUSTOM}{unit}")):
+        Path(f"{name}.toml").write_text(
+            TURNING.partition('kind = "ackermann"')[0] + vehicle
+        )
+        command = [
+            *places.with_policy(f"{name}.toml", place),
+            "--horizon",
+            "9",
+            "--json",
+        ]
+        assert cli.main([*command, "--page", name]) == 0
+        cards.append(
+            json.loads(capsys.readouterr().out)["mitsuba"]["straight"]["no_object"]
+        )
+    other, mine = cards
+    assert mine["cross_track_mean_m"] == pytest.approx(other["cross_track_mean_m"])
+    (row,) = (
+        x
+        for x in Path("mine/turn-drive.md").read_text().split("\n")
+        if x.startswith("| mitsuba | straight | no_object | 2 |")
+    )
+    assert row.endswith("| – |") != has_expert
+    assert mine["expert"] == (pytest.approx(other["expert"]) if has_expert else None)
+
+
 def test_a_scenario_is_driven_in_its_own_scene(place, monkeypatch, capsys):
     painted, seen = evaluate_work.make_environment, []
 

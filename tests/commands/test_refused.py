@@ -111,11 +111,12 @@ evaluate table.toml @place => table.toml: vehicles: has no effect without \[scen
 evaluate noise.bin @place => noise.bin: .*its suffix tells no kind
 evaluate noise.safetensors @place => noise.safetensors: 
 evaluate damaged.safetensors @place --page out => damaged.json
-evaluate car.toml @place => gives rad/s, the car of the place takes rad
+evaluate car.toml @place => the car of the place takes rad, .* gives rad/s
+evaluate angle.toml @place => the car of the place takes rad/s, .* gives rad;
 evaluate lag.toml @place => lag.toml: vehicle.lag: unknown key
 evaluate camera.toml @place => camera.toml: camera.width: .*greater
 evaluate custom.toml @place --environments mujoco => mujoco drives a car with wheels
-evaluate --place room --environments mitsuba => gives rad/s, the car .* takes rad
+evaluate --place room --environments mitsuba => the car .* takes rad, .* gives rad/s
 @bad => it must be finite
 car drive => --policy: none; give a file, expert, or http://HOST:PORT
 car drive --policy gone.safetensors => gone.safetensors
@@ -159,6 +160,7 @@ TEXTS = {
     "rows.json": '{"frames": [{"transform_matrix": [[1, 0, 0, 0]]}]}',
     "car.toml": f'{TABLES}"ackermann"\n',
     "camera.toml": '[policy]\nfile = "a.pt2"\n[camera]\nwidth = 0\n',
+    "angle.toml": '[policy]\nfile = "a.pt2"\ncontrol_unit = "rad"\n',
     "lag.toml": f'{TABLES}"ackermann"\nlag = 1\n',
     "custom.toml": f'{TABLES}"custom"\nfunction = "a.py:car"\ncontrol_limit = 1.0\n',
     "painted.xml": PAINTED,

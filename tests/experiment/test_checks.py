@@ -24,6 +24,7 @@ from mi_nerfattack.experiment.checks import standing
 from mi_nerfattack.experiment.checks.before_attack import (
     likeness_findings,
     speed_findings,
+    unit_findings,
 )
 from mi_nerfattack.experiment.checks.check import duration
 from mi_nerfattack.experiment.checks.cost import planned_periods
@@ -410,6 +411,28 @@ def test_speeds_of_vehicle_and_route(scenario_folder, vehicle, drive, numbers):
     found = " ".join(speed_findings(build_world(scenario, scenario.build_policy())))
     found = found.replace("routes.json", "").replace("'line'", "")
     assert re.findall(r"\d+(?:\.\d+)?", found) == numbers
+
+
+@pytest.mark.parametrize(
+    ("keys", "vehicle", "named"),
+    [
+        ("", "", []),  # PilotNet's file says it, and so does the vehicle's kind
+        ("control_scale = 2.0", "", ["policy"]),
+        ('control_scale = 2.0\ncontrol_unit = "rad/s"', "", []),
+        ("", CUSTOM, ["vehicle"]),
+        ("control_scale = 2.0", CUSTOM, ["policy", "vehicle"]),
+        ("", f'{CUSTOM}control_unit = "rad/s"', []),
+    ],
+)
+def test_units_that_nothing_says(scenario_folder, keys, vehicle, named):
+    (scenario_folder / "car.py").write_text(CAR)
+    text = (scenario_folder / "scenario.toml").read_text()
+    path = scenario_folder / "units.toml"
+    path.write_text(text.replace("[policy]", f"[policy]\n{keys}") + vehicle)
+    scenario, _ = load_scenario(path)
+    found = list(unit_findings(build_world(scenario, scenario.build_policy())))
+    keys = " and ".join(f"{name}.control_unit" for name in named)
+    assert [line.partition(":")[0] for line in found] == [keys] * bool(named)
 
 
 ROUNDED = """\

@@ -57,6 +57,13 @@ route = "lane" -> => :2: scene.route: is missing
 [vehicle]; kind = "custom"; state_size = 2 => vehicle.state_size: .*equal to 3
 [vehicle]; kind = "custom"; function = "a.py:car"; control_limit = 1.0; state_size = 5
   rest_state = [5.0] => vehicle.rest_state: has 1 numbers; .* 2 or none
+[vehicle]; kind = "custom"; function = "a.py:car"; control_limit = 1.0
+  control_unit = "rad" => vehicle.wheelbase_m: is missing; control_unit = "rad" needs it
+[vehicle]; kind = "custom"; function = "a.py:car"; control_limit = 1.6
+  control_unit = "rad"; wheelbase_m = 2.7 => vehicle.control_limit: .*below pi / 2
+[vehicle]; kind = "custom"; function = "a.py:car"; control_limit = 1.0
+  control_unit = "other"; [policy]; file = "a.pt"; control_unit = "rad"
+  => vehicle.kind: custom takes other, and a.pt gives rad; .*control_scale
 [vehicle]; delay_steps = -1 => vehicle.delay_steps: .*0
 [vehicle]; kind = "ackermann_rate"; steer_time_s = 0.03; substeps = 1
   => :15: vehicle.steer_time_s: .* rk4: .* raise substeps
@@ -104,6 +111,8 @@ route = "lane" -> => :2: scene.route: is missing
 [policy]; file = "a.pt"; goal.count = 2 => policy.goal.kind: is missing; one of
 [policy]; file = "a.pt"; kind = "keras" => policy.kind: is 'keras'
 [policy]; file = "a.pt"; control_scale = 0.0 => policy.control_scale: .*0
+[policy]; file = "a.pt"; control_unit = "rad" => kind: dubins takes rad/s, .* gives rad;
+[policy]; file = "a.pt"; control_unit = "deg" => policy.control_unit: .*'rad'.*'other'
 [policy]; file = "a.pt"; preprocess = { resize = [1, 2] } => resize: .*allowed: crop_px
 [policy]; file = "a.pt"; [policy.preprocess]; crop_px = [1, 2, 3, 4]
   crop_fraction = [0.1, 0.0, 0.0, 0.0] => crop_fraction: .*beside crop_px

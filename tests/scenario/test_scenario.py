@@ -122,6 +122,7 @@ def test_all_problems_of_a_table_are_told_at_once(load):
 
 @pytest.mark.parametrize("unit", ["rad/s", "rad"])
 def test_a_vehicle_takes_pilotnets_unit_or_a_factor_to_its_own(load, tmp_path, unit):
+    write_named_files(tmp_path)
     PilotNet(goals=1, max_control=0.4, unit=unit).save(tmp_path / "policy.safetensors")
     turned = f'{HEAD}[vehicle]\nkind = "ackermann"\n'
     fits, fits_not = (turned, HEAD) if unit == "rad" else (HEAD, turned)
@@ -129,6 +130,11 @@ def test_a_vehicle_takes_pilotnets_unit_or_a_factor_to_its_own(load, tmp_path, u
     with pytest.raises(InputError, match=f"vehicle.kind: .* gives {unit}; take ano"):
         load(fits_not)
     load(fits_not.replace(POLICY, f"{POLICY}\ncontrol_scale = 2"))
+    other = "rad" if unit == "rad/s" else "rad/s"
+    same, differs = (f'{POLICY}\ncontrol_unit = "{one}"' for one in (unit, other))
+    assert load(fits.replace(POLICY, same))[0].digest() == load(fits)[0].digest()
+    with pytest.raises(InputError, match="policy.control_unit: .*says it in its file"):
+        load(fits.replace(POLICY, differs))
 
 
 def test_resolve(tmp_path):

@@ -96,21 +96,14 @@ class PolicyFile:
         Raises:
             InputError: the policy's file and the section [vehicle] differ.
         """
-        from mi_nerfattack.scenario.policy import PilotNetSection
-        from mi_nerfattack.scenario.vehicle import CustomSection
-
         section, vehicle = self.section, self.vehicle
-        stored = section.unit() if isinstance(section, PilotNetSection) else None
-        if vehicle is None or isinstance(vehicle, CustomSection):
-            return stored, None
-        car = vehicle.car()
-        if stored not in (None, car.control_unit):
-            raise InputError(
-                f"{self.name}: vehicle.kind: this one takes {car.control_unit}, and "
-                f"{section.source} gives {stored}; take another of them"
-            )
-        is_angle = car.control_unit == "rad"
-        return car.control_unit, round(car.wheelbase, 6) if is_angle else None
+        if vehicle is None or not vehicle.has_expert:
+            unit = section.unit()
+            return None if unit == "other" else unit, None
+        if misfit := section.misfit(vehicle.unit):
+            raise InputError(f"{self.name}: vehicle.kind: this one {misfit}")
+        wheelbase_m = round(vehicle.car().wheelbase, 6)
+        return vehicle.unit, wheelbase_m if vehicle.unit == "rad" else None
 
     def place(self, place: Place, is_chosen: bool) -> Place:
         """Return where the policy drives, with its camera and its car.

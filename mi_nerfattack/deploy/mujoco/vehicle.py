@@ -118,6 +118,11 @@ class MujocoVehicle(AbstractVehicle):
         timestep: float = mjcf_car.MAX_TIMESTEP,
     ) -> None:
         self.car, self.handling = car, handling or Handling()
+        if steering is None and car.control_unit not in _STEERING:
+            raise InputError(
+                f"car.control_unit: {car.control_unit!r}; a car with wheels takes "
+                f"{' or '.join(_STEERING)}, or give steering"
+            )
         self.steering = steering or _STEERING[car.control_unit](car.max_control)
         self.max_control = self.steering.max_control
         self.control_unit = self.steering.unit

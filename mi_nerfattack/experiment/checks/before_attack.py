@@ -189,6 +189,19 @@ def speed_findings(world: World) -> Iterator[str]:
     )
 
 
+def unit_findings(world: World) -> Iterator[str]:
+    """Tell of units that nothing says, so that nothing compares them."""
+    scenario = world.scenario
+    units = {"policy": scenario.policy.unit(), "vehicle": scenario.vehicle.unit}
+    missing = [f"{name}.control_unit" for name, unit in units.items() if unit is None]
+    if missing:
+        yield (
+            f"{' and '.join(missing)}: missing, so nothing compares the control of the "
+            'policy with the control of the vehicle; give "rad/s" (heading rate), '
+            '"rad" (steering angle) or "other"'
+        )
+
+
 def horizon_findings(world: World, first: Drive) -> Iterator[str]:
     """Tell of a horizon that an open route is too short for."""
     route = world.route

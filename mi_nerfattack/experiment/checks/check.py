@@ -33,6 +33,7 @@ from mi_nerfattack.experiment.checks.before_attack import (
     place_findings,
     route_findings,
     speed_findings,
+    unit_findings,
 )
 from mi_nerfattack.experiment.checks.cost import Cost, estimate
 from mi_nerfattack.render.camera.intrinsics import from_fov, mount_matrix
@@ -81,7 +82,7 @@ class Check:
         """
         world = self.world
         departure_limit(world.route.lane_width_m, world.scenario.vehicle.width_m)
-        self.doubts += speed_findings(world)
+        self.doubts += [*unit_findings(world), *speed_findings(world)]
         try:
             if drives:
                 self._told(self._drive)

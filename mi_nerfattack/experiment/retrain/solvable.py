@@ -9,6 +9,7 @@ import numpy as np
 
 from mi_nerfattack.deploy.registry import kinematic_vehicle
 from mi_nerfattack.deploy.roadside.footprint import Shape
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.retrain.among import attacked_objects, found_place
 from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.fields.grid import GridField
@@ -50,10 +51,15 @@ def drive_expert(found: FoundAttack) -> Driven:
     """Let the expert drive a run's scenario; nothing is rendered.
 
     Raises:
-        InputError: see :func:`among.found_place`.
+        InputError: see :func:`among.found_place`, or no expert knows the vehicle.
     """
     place = found_place([found])
     scenario, route, car = found.scenario, found.route, place.car
+    if not scenario.vehicle.has_expert:
+        raise InputError(
+            f"{found.folder}: vehicle.control_unit: is neither rad/s nor rad, and no "
+            "expert drives such a vehicle; give it, and attack once more"
+        )
     vehicle = kinematic_vehicle(place)
     expert = expert_for(
         car.control_unit, route, place.period, car.max_control, car.wheelbase

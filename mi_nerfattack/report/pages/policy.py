@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
 
-from mi_nerfattack.evaluation.metrics import cells
 from mi_nerfattack.io import files
 from mi_nerfattack.report.columns import Column, Table
 from mi_nerfattack.report.pages.sections import Block, Picture, code, markdown
 from mi_nerfattack.report.plots.drives import NamedDrives, errors
+from mi_nerfattack.report.table import card_rows
 from mi_nerfattack.system.machine import machine
 from mi_nerfattack.training.record import TrainingRecord
 from mi_nerfattack.training.validation import ERROR, Epoch
@@ -122,7 +122,7 @@ def page_text(name: str, document: Mapping[str, Any]) -> str:
         name: of the policy.
         document: content of the JSON beside it.
     """
-    rows = list(_cells(document["environments"]))
+    rows = list(card_rows(document["environments"]))
     runs = [{**cell, **run} for cell in rows for run in cell["per_run"]]
     departed = [run for run in runs if run["departed"]]
     stayed = [run for run in runs if not run["departed"]]
@@ -175,7 +175,7 @@ def _recorded(value: float | None) -> str:
 
 def summary(card: Mapping[str, Any]) -> str:
     """Say in a sentence how many drives left their lane, and the errors."""
-    rows = list(_cells(card))
+    rows = list(card_rows(card))
     total = sum(row["n"] for row in rows)
     left = sum(row["drives_departed"] for row in rows)
     means = [row["cross_track_mean_m"] for row in rows]
@@ -218,15 +218,8 @@ def _measuring(document: Mapping[str, Any]) -> dict[str, str]:
     return _flat(shown)
 
 
-def _cells(card: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Yield the figures of each cell of a card with its names."""
-    for cell in cells(card, "environment", "route", "case"):
-        expert = cell.get("expert", {}).get("cross_track_mean_m")
-        yield {**cell, "expert_m": expert}
-
-
 def _limits(card: Mapping[str, Any]) -> dict[str, float]:
-    return {cell["route"]: cell["departure_limit_m"] for cell in _cells(card)}
+    return {cell["route"]: cell["departure_limit_m"] for cell in card_rows(card)}
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
