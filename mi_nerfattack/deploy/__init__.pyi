@@ -14,6 +14,7 @@ from .mujoco.vehicle import HeadingRate as HeadingRate
 from .mujoco.vehicle import MujocoVehicle as MujocoVehicle
 from .mujoco.vehicle import SteeringAngle as SteeringAngle
 from .place import Conditions as Conditions
+from .place import Place as Place
 from .place import bundled_place as bundled_place
 from .registry import make_environment as make_environment
 from .replay.environment import ReplayEnvironment as ReplayEnvironment
