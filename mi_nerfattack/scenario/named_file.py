@@ -18,6 +18,7 @@ from mi_nerfattack.io import files
 from mi_nerfattack.scenario.section import Section
 from mi_nerfattack.scenario.user_code import (
     check_trust,
+    helper_files,
     import_function,
     load_function,
     module_file,
@@ -73,9 +74,9 @@ class NamedFile:
     def content(self) -> dict[str, str]:
         """Return the name without its folder, and the SHA-256 of the content.
 
-        An XML file counts with the files that it and included ones name; the folder of
-        a recording with all that lies in it. Of an installed module, its own source
-        counts; the name where it has none.
+        An XML file counts with the files that it and included ones name, a Python file
+        with its `helper_files`, the folder of a recording with all that lies in it. Of
+        an installed module, its own source counts; the name where it has none.
 
         Raises:
             InputError: the file cannot be read.
@@ -93,6 +94,9 @@ class NamedFile:
         if self.path.suffix.lower() == ".xml":
             for inner in _files_of(self.path):
                 digest.update(hashlib.sha256(_read(inner)).digest())
+        if self.function:
+            for name, helper in sorted(helper_files(self.path).items()):
+                digest.update(f"{name} {files.sha256(helper)}\n".encode())
         shown = ":".join(filter(None, (self.path.name, self.function)))
         return {"file": shown, "sha256": digest.hexdigest()}
 

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import ast
+import builtins
 import hashlib
 import importlib
 import importlib.util
+import os
 import sys
-from collections.abc import Callable
-from importlib.machinery import PathFinder
+from collections.abc import Callable, Iterator
+from importlib.machinery import PathFinder, SourceFileLoader
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.io import files
+
+#: What a helper may not replace: modules of Python, and this package.
+_NO_HELPERS = {*sys.stdlib_module_names, __name__.partition(".")[0]}
 
 
 def check_trust(key: str, name: str, trusted: bool) -> None:
@@ -38,8 +44,9 @@ def check_trust(key: str, name: str, trusted: bool) -> None:
 def load_function(path: str | Path, name: str) -> Callable[..., Any]:
     """Run a Python file and return what it calls `name`.
 
-    The file runs with all rights of this process: name files that you trust. Files
-    beside it cannot be imported from it.
+    The file runs with all rights of this process: name files that you trust. The file
+    and its `helper_files` import each other by name, and nothing else finds them. Each
+    call runs all of them again.
 
     Args:
         path: Python source.
@@ -53,6 +60,9 @@ def load_function(path: str | Path, name: str) -> Callable[..., Any]:
     digest = hashlib.sha256(f"{Path(path).resolve()}\0{source}".encode()).hexdigest()
     module = ModuleType(f"mi_nerfattack_user_{digest[:16]}")
     module.__file__ = str(path)
+    if helpers := helper_files(path):
+        module.__package__ = _Helpers.offer(f"{module.__name__}_files", helpers)
+        module.__dict__["__builtins__"] = _builtins(module.__package__)
     try:
         code = compile(source, str(path), "exec")
     except (SyntaxError, ValueError) as err:
@@ -65,7 +75,9 @@ def load_function(path: str | Path, name: str) -> Callable[..., Any]:
     except Exception as err:
         if is_interrupt(err):
             raise
-        raise InputError(f"{path}: raised {type(err).__name__}: {err}") from err
+        missing = isinstance(err, ModuleNotFoundError)
+        remedy = "; install it, or put it in the folder of this file" * missing
+        raise InputError(f"{path}: raised {type(err).__name__}: {err}{remedy}") from err
     found = module.__dict__.get(name)
     if not callable(found):
         known = [key for key, value in module.__dict__.items() if _own(value, module)]
@@ -73,6 +85,116 @@ def load_function(path: str | Path, name: str) -> Callable[..., Any]:
             f"{path}: has no function {name!r}; it has {', '.join(known) or 'none'}"
         )
     return found
+
+
+def helper_files(path: str | Path) -> dict[str, Path]:
+    """Find the modules in the folder of a Python file that the file imports.
+
+    A module, or a package with an ``__init__.py``, counts if an import statement of the
+    file or of another helper names it. It goes before an installed module of the same
+    name, as in a script.
+
+    Returns:
+        files by dotted name; empty where the file itself cannot be parsed.
+    """
+    folder, found, queue = Path(path).parent, dict[str, Path](), [("", Path(path))]
+    while queue:
+        for name in _imported(*queue.pop()):
+            parts = name.split(".")
+            for count in range(1, len(parts) + 1):
+                dotted, place = ".".join(parts[:count]), folder.joinpath(*parts[:count])
+                candidates = place / "__init__.py", place.with_suffix(".py")
+                file = next(filter(os.path.isfile, candidates), None)
+                if file is None or parts[0] in _NO_HELPERS:
+                    break
+                if dotted not in found:
+                    found[dotted] = file
+                    is_package = file.name == "__init__.py"
+                    queue.append((dotted if is_package else _parent(dotted), file))
+    return found
+
+
+def _imported(package: str, path: Path) -> Iterator[str]:
+    """Yield what import statements of a file of a package name: modules, or parts."""
+    try:
+        tree = ast.parse(files.read_bytes(path, files.MAX_TEXT_BYTES))
+    except (SyntaxError, ValueError):  # running it says why
+        return
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            above = package if node.level else ""
+            for _ in range(node.level - 1):
+                above = _parent(above)
+            for alias in node.names:
+                yield ".".join(filter(None, (above, node.module, alias.name)))
+
+
+def _parent(name: str) -> str:
+    return name.rpartition(".")[0]
+
+
+class _Helpers:
+    """Finder of helpers, under the name of a package that belongs to one file."""
+
+    files: ClassVar[dict[str, Path]] = {}
+
+    @classmethod
+    def offer(cls, package: str, helpers: dict[str, Path]) -> str:
+        """Let helpers be imported from a package, which is made; return its name."""
+        for name in [name for name in sys.modules if name.startswith(f"{package}.")]:
+            del sys.modules[name]
+        sys.modules[package] = ModuleType(package)
+        sys.modules[package].__path__ = []
+        cls.files |= {f"{package}.{name}": file for name, file in helpers.items()}
+        if cls not in sys.meta_path:
+            sys.meta_path.insert(0, cls)
+        return package
+
+    @classmethod
+    def find_spec(cls, name: str, path: Any = None, target: Any = None) -> Any:
+        """Return how to load a helper; None of other modules."""
+        del path, target
+        if (file := cls.files.get(name)) is None:
+            return None
+        inside: list[str] | None = [] if file.name == "__init__.py" else None
+        return importlib.util.spec_from_file_location(
+            name,
+            file,
+            loader=_HelperLoader(name, str(file)),
+            submodule_search_locations=inside,
+        )
+
+
+class _HelperLoader(SourceFileLoader):
+    """Runs a helper from its source; writes no bytecode."""
+
+    def get_code(self, fullname: str) -> Any:
+        """Compile the source."""
+        source = files.read_bytes(self.path, files.MAX_TEXT_BYTES)
+        return self.source_to_code(source, self.path)
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Run the code, which finds other helpers."""
+        package = module.__name__.partition(".")[0]
+        module.__dict__["__builtins__"] = _builtins(package)
+        super().exec_module(module)
+
+
+def _builtins(package: str) -> dict[str, Any]:
+    """Return Python's builtins, whose imports look into a package of helpers first."""
+
+    def find(
+        name: str, about: Any = None, own: Any = None, parts: Any = (), level: int = 0
+    ) -> Any:
+        top = name.partition(".")[0]
+        if level or f"{package}.{top}" not in _Helpers.files:
+            return builtins.__import__(name, about, own, parts, level)
+        found = builtins.__import__(f"{package}.{name}", about, own, parts)
+        return found if parts else sys.modules[f"{package}.{top}"]
+
+    return vars(builtins) | {"__import__": find}
 
 
 def import_function(reference: str) -> Callable[..., Any]:
