@@ -49,6 +49,7 @@ class CompareField:
         from mi_nerfattack.fields import load_field
         from mi_nerfattack.io import files
         from mi_nerfattack.report.pages import compare
+        from mi_nerfattack.report.pages.verdict import verdict
 
         output = self.output or self.field.with_suffix(".compare")
         files.check_folder(output)
@@ -68,7 +69,8 @@ class CompareField:
         def show() -> None:
             out = console()
             out.print(compare.routes_table(comparison))
-            lines = compare.settings_line(comparison), compare.verdict(comparison)
+            text = verdict(compare.judge_routes(comparison))
+            lines = compare.settings_line(comparison), text
             for line in (*lines, f"Wrote {output / 'report.html'}."):
                 out.print(line, soft_wrap=True, highlight=False)
 

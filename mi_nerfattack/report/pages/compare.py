@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,18 @@ from mi_nerfattack.io import files
 from mi_nerfattack.io.strict import finite
 from mi_nerfattack.report.columns import Column, Table
 from mi_nerfattack.report.pages.sections import Block, Picture, write_report
+from mi_nerfattack.report.pages.verdict import (
+    MAX_DEPTH_M,
+    MIN_PSNR_DB,
+    ROUTE,
+    Criterion,
+    judge,
+    verdict,
+)
 from mi_nerfattack.report.plots.views import write_along, write_colours, write_depths
 
 _PSNR, _DEPTH = "PSNR (dB)\nmean / min", "depth error (m)\nmedian / 90 %"
-_HOLES = "holes\n(%)"
+_HOLES, _FOG = "holes\n(%)", "hazy\n(%)"
 _ROUTES = (
     Column("route", "{name}"),
     Column(_PSNR, "{psnr_mean_db:.1f} / {psnr_min_db:.1f}"),
@@ -28,12 +36,18 @@ _ROUTES = (
     ),
     Column("wrong\n(%)", "{wrong_opacity:.2%}"),
     Column(_HOLES, "{holes:.2%}"),
-    Column("hazy\n(%)", "{hazy:.2%}"),
+    Column(_FOG, "{hazy:.2%}"),
 )
 _STATION = "arc_m psnr_db ceiling_db ssim depth_median_m depth_p90_m wrong hazy holes"
-MIN_PSNR_DB = 26.0  # mean along a route
-MAX_DEPTH_M = 0.1  # median error along a route, near the camera
-MAX_HOLES = 0.005  # share of the scene's surfaces, mean along a route
+_NOISY = "The scene's frames are too noisy: compare with more samples per pixel."
+#: Columns of the figures that have a limit.
+_LIMITED = {
+    "psnr_db": _PSNR,
+    "psnr_min_db": _PSNR,
+    "depth_median_m": _DEPTH,
+    "holes": _HOLES,
+    "hazy": _FOG,
+}
 
 
 def write_compare_report(folder: Path, comparison: Comparison, title: str) -> Path:
@@ -67,9 +81,8 @@ def write_compare_report(folder: Path, comparison: Comparison, title: str) -> Pa
                 Picture("scene, field, and their difference", colours),
                 Picture(text, depths),
             ]
-    return write_report(
-        root, title, verdict(comparison), document(comparison), sections
-    )
+    text = verdict(judge_routes(comparison))
+    return write_report(root, title, text, document(comparison), sections)
 
 
 def document(comparison: Comparison) -> dict[str, Any]:
@@ -79,7 +92,7 @@ def document(comparison: Comparison) -> dict[str, Any]:
     table = {
         "routes": {route.name: _route_entry(route) for route in comparison.routes},
         "settings": settings,
-        "close_enough": not any(map(_faults, comparison.routes)),
+        "good_enough": all(item.met for item in judge_routes(comparison)),
         "wall_s": comparison.wall_s,
     }
     return finite(table)
@@ -106,49 +119,25 @@ def _route_entry(route: RouteComparison) -> dict[str, Any]:
     }
 
 
-def verdict(comparison: Comparison) -> str:
-    """Say in words whether the field is close enough to attack a policy in."""
-    wanted = (
-        f"at least {MIN_PSNR_DB:g} dB on average along each route, a median depth "
-        f"error of at most {MAX_DEPTH_M:g} m within {comparison.options.near_m:g} m, "
-        f"and holes in at most {100 * MAX_HOLES:g} % of the scene's surfaces"
-    )
-    far = [route.name for route in comparison.routes if _faults(route)]
-    if not far:
-        return f"Close enough: {wanted}."
-    noisy = [route.name for route in comparison.routes if _is_noise(route)]
-    advice = []
-    if noisy:
-        advice.append(
-            f"The scene's frames are too noisy on {', '.join(noisy)}; compare with "
-            "more samples per pixel."
-        )
-    if noisy != far:
-        advice.append(
-            "Capture more views where the frames are worst, and fit for longer."
-        )
-    return (
-        f"Not close enough on {', '.join(far)}: {wanted} are needed. What is found in "
-        f"the field may not hold in the scene. {' '.join(advice)}"
-    )
+def judge_routes(comparison: Comparison) -> list[Criterion]:
+    """Judge the field along each route, by the criteria of a fit."""
+    return [
+        replace(item, name=f"{item.name} on {route.name}")
+        for route in comparison.routes
+        for item in _judged(route)
+    ]
 
 
-def _faults(route: RouteComparison) -> list[str]:
-    """Return the columns in which a route is too far off.
-
-    What is unknown is no fault: there is nothing near, or there are no surfaces.
-    """
-    faults = [] if route.mean("psnr_db") >= MIN_PSNR_DB else [_PSNR]
-    faults += [_DEPTH] if route.depth_median_m > MAX_DEPTH_M else []
-    return faults + ([_HOLES] if route.mean("holes") > MAX_HOLES else [])
-
-
-def _is_noise(route: RouteComparison) -> bool:
-    """Whether the noise of the scene's frames is all that is wrong with a route."""
+def _judged(route: RouteComparison) -> list[Criterion]:
+    """Judge one route; where noise alone is wrong, the advice is less of it."""
+    found = judge(route.stations, subject=ROUTE, depth_m=route.depth_median_m)
     error, noise = (
         10 ** (-0.1 * route.mean(name)) for name in ("psnr_db", "ceiling_db")
     )
-    return _faults(route) == [_PSNR] and error - noise <= 10 ** (-0.1 * MIN_PSNR_DB)
+    is_noise = error - noise <= 10 ** (-0.1 * MIN_PSNR_DB)
+    if is_noise and [item.figure for item in found if not item.met] == ["psnr_db"]:
+        found = [replace(item, advice=_NOISY) for item in found]
+    return found
 
 
 def settings_line(comparison: Comparison) -> str:
@@ -169,6 +158,12 @@ def settings_line(comparison: Comparison) -> str:
         f"opacity in the field from {HAZY[0]:g} to {HAZY[1]:g}. "
         f"{comparison.wall_s:.0f} s."
     )
+
+
+def _faults(route: RouteComparison) -> set[str]:
+    """Return the columns in which a route is not good enough."""
+    failed = [item.figure for item in _judged(route) if not item.met]
+    return {_LIMITED[figure] for figure in failed if figure in _LIMITED}
 
 
 def routes_table(comparison: Comparison) -> Table:

@@ -1,4 +1,8 @@
-"""Whether a fitted field is good enough to test a policy in, by stated criteria."""
+"""Whether a field is good enough to test a policy in, by stated criteria.
+
+Held-out views judge a fit, and frames along the routes a field that has a scene. The
+criteria are the same, and the frames decide, because a policy sees them.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +13,13 @@ import numpy as np
 
 from mi_nerfattack.fit.scores import HAZY, SOLID, ViewScore, least, mean
 
-MIN_PSNR_DB = 24.0  # mean over held-out views
-MIN_WORST_DB = 18.0  # of any held-out view
+MIN_PSNR_DB = 24.0  # mean over views
+MIN_WORST_DB = 18.0  # of any view
 MAX_GAP_DB = 5.0  # fitted less held-out views
-MAX_HAZY = 0.10  # share of rays, mean over held-out views
-MAX_HOLES = 0.005  # share of known surfaces, mean over held-out views
-MIN_VIEWS = 3  # held-out views that a mean is worth something from
+MAX_HAZY = 0.10  # share of rays, mean over views
+MAX_HOLES = 0.005  # share of known surfaces, mean over views
+MAX_DEPTH_M = 0.1  # median error along a route, near the camera
+MIN_VIEWS = 3  # from which on a mean is worth something
 
 
 @dataclass(frozen=True)
@@ -23,29 +28,34 @@ class Subject:
 
     Attributes:
         use: what the field must be good enough for.
-        reach: where it is, as far as views tell.
+        views: what judges it.
+        reach: where it is good enough, as far as the views tell.
         few: advice where there are few views.
         blurred: where the mean PSNR is low.
         worst: where one view is bad.
         fog: where many rays are hazy.
         holes: where light comes through known surfaces.
         learnt: where the fitted rays are much better than the held-out ones.
+        depth: where surfaces are nearer or farther than in the scene.
     """
 
     use: str
+    views: str
     reach: str
     few: str
     blurred: str
     worst: str
     fog: str
     holes: str
-    learnt: str
+    learnt: str = ""
+    depth: str = ""
 
 
 SCENE = Subject(
     use="to test a policy in",
+    views="held-out views",
     reach="near the cameras and from heights and headings like theirs. Where there is "
-    "a scene to deploy in, compare with it along the routes too.",
+    "a scene to deploy in, 'mi-nerfattack render compare' decides.",
     few="Take more images: every 8th is held out, and so few say little.",
     blurred="Fit for longer, or check poses, intrinsics and blurred images.",
     worst="Look at the worst views: add images where they were taken, and leave out "
@@ -57,8 +67,22 @@ SCENE = Subject(
     learnt="The field has learnt images, not the scene: add images between the "
     "present ones, refine the poses, or take a smaller network.",
 )
+_MORE = "Capture more views where the frames are worst, and fit for longer."
+ROUTE = Subject(
+    use=SCENE.use,
+    views="frames",
+    reach="with the driving camera along the routes. This decides, and not the "
+    "held-out views of the fit, because a policy sees these frames.",
+    few="Take frames nearer to each other (--every-m).",
+    blurred=_MORE,
+    worst=_MORE,
+    fog=SCENE.fog,
+    holes=_MORE,
+    depth=_MORE,
+)
 OBJECT = Subject(
     use="as an object to attack",
+    views="held-out views",
     reach="seen from where these views lie, and not from nearer than a voxel can show.",
     few="Give more views (--views for a mesh): every 8th is held out, and so few say "
     "little.",
@@ -80,6 +104,7 @@ class Criterion:
     """One thing that was measured and what it should be.
 
     Attributes:
+        figure: what was measured, as one word.
         name: what was measured, with its unit.
         value: as measured.
         limit: of the value.
@@ -88,6 +113,7 @@ class Criterion:
         subject: what the field stands for.
     """
 
+    figure: str
     name: str
     value: float
     limit: float
@@ -113,35 +139,42 @@ def judge(
     scores: Sequence[ViewScore],
     fitted_db: float | None = None,
     subject: Subject = SCENE,
+    depth_m: float = float("nan"),
 ) -> list[Criterion]:
-    """Judge a fit by its held-out views.
+    """Judge a field by views of it.
 
     Args:
-        scores: of the held-out views, at least one.
+        scores: of the views, at least one.
         fitted_db: PSNR of the rays fitted to, at the end of the fit; None if unknown.
         subject: what the field stands for.
+        depth_m: median error of the depth near the camera, metres; NaN if unknown.
     """
     found: list[Criterion] = []
 
-    def add(name: str, value: float, limit: float, at_least: bool, advice: str) -> None:
-        found.append(Criterion(name, value, limit, at_least, advice, subject))
+    def add(
+        figure: str, name: str, value: float, limit: float, at_least: bool, advice: str
+    ) -> None:
+        found.append(Criterion(figure, name, value, limit, at_least, advice, subject))
 
     psnr, worst = mean(scores, "psnr_db"), least(scores, "psnr_db")
-    add("held-out views", len(scores), MIN_VIEWS, True, subject.few)
-    name = "mean PSNR of held-out views (dB)"
-    add(name, psnr, MIN_PSNR_DB, True, subject.blurred)
-    name = "PSNR of the worst held-out view (dB)"
-    add(name, worst, MIN_WORST_DB, True, subject.worst)
+    add("views", subject.views, len(scores), MIN_VIEWS, True, subject.few)
+    name = f"mean PSNR of {subject.views} (dB)"
+    add("psnr_db", name, psnr, MIN_PSNR_DB, True, subject.blurred)
+    name = f"least PSNR of {subject.views} (dB)"
+    add("psnr_min_db", name, worst, MIN_WORST_DB, True, subject.worst)
     name = f"share of rays with an opacity from {HAZY[0]:g} to {HAZY[1]:g}"
-    add(name, mean(scores, "hazy"), MAX_HAZY, False, subject.fog)
+    add("hazy", name, mean(scores, "hazy"), MAX_HAZY, False, subject.fog)
     if not np.isnan(holes := mean(scores, "holes")):
         name = f"share of known surfaces with an opacity below {SOLID:g}"
-        add(name, holes, MAX_HOLES, False, subject.holes)
+        add("holes", name, holes, MAX_HOLES, False, subject.holes)
+    if not np.isnan(depth_m):
+        name = "median error of the depth near the camera (m)"
+        add("depth_median_m", name, depth_m, MAX_DEPTH_M, False, subject.depth)
     if fitted_db is not None:
         pooled = pooled_db([score.psnr_db for score in scores])
         gap = 0.0 if pooled == fitted_db else fitted_db - pooled  # both may be infinite
         name = "PSNR of fitted rays less that of held-out ones (dB)"
-        add(name, gap, MAX_GAP_DB, False, subject.learnt)
+        add("gap_db", name, gap, MAX_GAP_DB, False, subject.learnt)
     return found
 
 
@@ -152,5 +185,5 @@ def verdict(criteria: Sequence[Criterion]) -> str:
     if not failed:
         return f"Good enough {subject.use}, as far as these views tell: {subject.reach}"
     names = "; ".join(item.name for item in failed)
-    advice = " ".join(item.advice for item in failed)
+    advice = " ".join(dict.fromkeys(item.advice for item in failed))
     return f"Not good enough {subject.use}: {names}. {advice}"
