@@ -34,6 +34,13 @@ Name = Annotated[str, Field(min_length=1, description="a name, not empty")]
 ControlUnit = Annotated[
     str, Field(pattern="^rad(/s)?$", description="'rad/s' or 'rad'")
 ]
+Facing = Annotated[
+    str,
+    Field(
+        pattern="^(shape|along|traffic)$",
+        description="'shape', 'along' or 'traffic'",
+    ),
+]
 CarUnit = Annotated[
     str, Field(pattern="^(rad(/s)?|other)$", description="'rad/s', 'rad' or 'other'")
 ]

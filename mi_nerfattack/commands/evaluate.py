@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 import tyro
 
 from mi_nerfattack.commands.shared.evaluate_options import (
+    Facing,
     PlaceOptions,
     parse_conditions,
     parse_scales,
@@ -59,9 +60,11 @@ class Evaluate:
     runs: int = 20
     """Drives of each case, environment and route."""
     objects: tuple[int, ...] = (1,)
-    """Numbers of objects beside the road, a case each; 0: without objects alone."""
+    """Numbers of objects, a case each; 0: no objects alone."""
     scale: tuple[float, ...] = ()
-    """Least and most factor to the natural size, of all objects or of each --object."""
+    """Least and most factor to the size, of all or each --object."""
+    facing: Facing = "shape"
+    """Boards alone face the traffic, none, or all."""
     seed: int = 1
     """Seed of starts, textures and images."""
     horizon: int = 1000
@@ -172,7 +175,9 @@ class Evaluate:
             settings,
             runs=self.runs,
             roadside=replace(
-                settings.roadside, scales=scales or settings.roadside.scales
+                settings.roadside,
+                scales=scales or settings.roadside.scales,
+                facing=self.facing,
             ),
             objects=self.objects,
             seed=self.seed,

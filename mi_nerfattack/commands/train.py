@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from mi_nerfattack.commands.shared.evaluate_options import (
+    Facing,
     PlaceOptions,
     parse_scales,
 )
@@ -87,11 +88,13 @@ class Train:
     validate_in: tuple[str, ...] = ()
     """Their environments; all that are used by default."""
     runs: int = 2
-    """Drives of each case of the last validation."""
+    """Drives per case of the last validation."""
     most_objects: int | None = None
     """Most objects beside the road in a frame."""
     scale: tuple[float, ...] = ()
     """Least and most factor to the size, as of evaluate."""
+    facing: Facing = "shape"
+    """What faces the traffic."""
     objects: tuple[int, ...] = (1,)
     """Numbers of objects in the last validation."""
     workers: int | None = None
@@ -199,7 +202,7 @@ class Train:
         count = len(self._place(preset).objects)
         collecting, drives = preset.collecting, EVALUATIONS[preset.place]
         scales = parse_scales(self.scale, count) or collecting.roadside.scales
-        roadside = replace(collecting.roadside, scales=scales)
+        roadside = replace(collecting.roadside, scales=scales, facing=self.facing)
         most = collecting.objects if self.most_objects is None else self.most_objects
         drives = replace(
             drives, runs=self.runs, objects=self.objects, roadside=roadside

@@ -15,7 +15,7 @@ FOUND = {name: findings_in(name, path) for name, path in pages().items()}
 # Pages that do not pass yet, with their number of findings; it may only fall.
 PENDING = {
     "docs/attack.md": 77,
-    "docs/environments.md": 27,
+    "docs/environments.md": 26,
     "docs/fields.md": 66,
     "docs/formats.md": 2,
     "docs/loop.md": 12,
@@ -30,7 +30,7 @@ PENDING = {
     "docs/room.md": 13,
     "docs/sweep.md": 44,
     "docs/table2/README.md": 11,
-    "docs/training.md": 28,
+    "docs/training.md": 27,
     "docs/transfer.md": 15,
     "docs/view.md": 18,
 }

@@ -12,6 +12,8 @@ from mi_nerfattack.render.camera.pose import Pose
 
 #: An object whose longer side is so many times the other stands along the road.
 _LONG = 1.5
+#: An object is a board if its thickness is a smaller share of its width and height.
+_FLAT = 0.25
 _POINTS = 64
 
 
@@ -57,6 +59,12 @@ class Shape:
     def is_long(self) -> bool:
         """Whether it stands along the road, as a car does."""
         return bool(self.size[:2].max() >= _LONG * self.size[:2].min())
+
+    @property
+    def is_board(self) -> bool:
+        """Whether it faces the traffic, as a billboard does."""
+        thickness, width = sorted(self.size[:2])
+        return bool(thickness < _FLAT * min(width, self.size[2]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,14 @@ from mi_nerfattack.deploy.roadside.surroundings import KERB_M, Surroundings
 from mi_nerfattack.deploy.roadside.view import Seen, look
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
-from mi_nerfattack.ranges import Count, NonNegative, Positive, Seconds, checked
+from mi_nerfattack.ranges import (
+    Count,
+    Facing,
+    NonNegative,
+    Positive,
+    Seconds,
+    checked,
+)
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -33,7 +40,9 @@ class Roadside:
     Objects stand off the lanes of all routes, beyond the kerb where a route has one,
     on even ground with nothing above it, clear of walls and of one another. One whose
     occupied box is at least 1.5 times as long as wide stands along the road to 4
-    degrees, either way round; others at any angle. Each is seen from a drive along the
+    degrees, either way round; others at any angle. A board, which is thinner than a
+    quarter of its width and of its height, faces the traffic on the route to 4 degrees
+    instead: by the wider of its +x and +y sides. Each is seen from a drive along the
     lane's centre: in frames of `view_s` together, not necessarily in a row, about
     `view_px` pixels or more show a part of it that neither the scene nor another object
     hides, as 64 of its points tell.
@@ -45,6 +54,8 @@ class Roadside:
         clearance_m: from walls, poles and other objects, metres.
         view_s: seconds of the drive in which an object is seen.
         view_px: pixels in which it is seen.
+        facing: "shape": boards alone face the traffic; "traffic": every object does;
+            "along": none does.
     """
 
     scales: tuple[tuple[Positive, Positive], ...] = ((1.0, 1.0),)
@@ -52,6 +63,7 @@ class Roadside:
     clearance_m: NonNegative = 0.3
     view_s: Seconds = 1.0
     view_px: Count = 12
+    facing: Facing = "shape"
 
     def __post_init__(self) -> None:
         for low, high in (*self.scales, self.gap_m):
@@ -140,7 +152,13 @@ class Roadside:
         gap = rng.uniform(*self.gap_m, _TRIES)
         turn = rng.uniform(-1, 1, _TRIES)
         back = np.pi * rng.integers(2, size=_TRIES)
-        if shape.is_long:
+        faces = self.facing == "traffic" or self.facing == "shape" and shape.is_board
+        is_along = shape.is_long and not faces
+        if faces:  # the side along +x is the wider one of a box that is thin along x
+            turn = _ALONG * turn + (
+                np.pi if shape.size[0] < shape.size[1] else np.pi / 2
+            )
+        elif is_along:
             turn = _ALONG * turn + back + (shape.size[0] < shape.size[1]) * np.pi / 2
         else:
             turn *= np.pi
@@ -148,7 +166,7 @@ class Roadside:
         reach = half[:, 0] * np.abs(np.sin(turn)) + half[:, 1] * np.abs(np.cos(turn))
         lateral = surroundings.kerb(route, arc, side) + gap + reach
         known = np.isfinite(lateral)
-        if shape.is_long:
+        if is_along:
             ends = arc + half.max(1) * [[-1.0], [1.0]]
             known &= np.abs(np.diff(route.heading_at(ends), axis=0)[0]) < _BEND
         arc, lateral = arc[known], (side * lateral)[known]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +13,7 @@ from pydantic import Field
 from mi_nerfattack.deploy.roadside.rule import Roadside
 from mi_nerfattack.deploy.roadside.surroundings import Surroundings
 from mi_nerfattack.fields.io import load_grid
-from mi_nerfattack.ranges import NonNegative, Positive, Seed
+from mi_nerfattack.ranges import Facing, NonNegative, Positive, Seed
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.scenario.named_file import File
@@ -32,6 +33,7 @@ class DrawSection(Section):
     scales: tuple[tuple[Positive, Positive], ...] = _RULE.scales
     gap_m: tuple[NonNegative, NonNegative] = _RULE.gap_m
     clearance_m: NonNegative = _RULE.clearance_m
+    facing: Facing = _RULE.facing
 
     def rule(self) -> Roadside:
         """Make the rule.
@@ -39,7 +41,13 @@ class DrawSection(Section):
         Raises:
             InputError: a range ends before it begins.
         """
-        return Roadside(self.scales, self.gap_m, self.clearance_m)
+        return replace(
+            _RULE,
+            scales=self.scales,
+            gap_m=self.gap_m,
+            clearance_m=self.clearance_m,
+            facing=self.facing,
+        )
 
 
 class Places:

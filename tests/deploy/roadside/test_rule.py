@@ -172,6 +172,41 @@ def test_things_stand_beyond_the_kerb_and_cars_along_it():
     np.testing.assert_array_equal(again[1].translation, second.translation)
 
 
+ALONG_X, ALONG_Y = np.eye(2)
+BOARD, CAR, BUS = (3.0, 0.2, 2.0), (4.2, 1.8, 1.5), (12.0, 2.5, 3.0)
+
+
+@pytest.mark.parametrize("route", [straight(), bent()], ids=["straight", "bent"])
+@pytest.mark.parametrize(
+    ("size", "facing", "front"),
+    [
+        (BOARD, "shape", ALONG_Y),
+        ((0.2, 3.0, 2.0), "shape", ALONG_X),
+        (BOARD, "along", None),
+        (CAR, "shape", None),
+        (CAR, "traffic", ALONG_Y),
+        ((4.0, 0.5, 0.4), "shape", None),  # flat on the ground
+        ((1.0, 1.0, 1.0), "traffic", ALONG_Y),
+    ],
+)
+def test_which_way_an_object_faces(route, size, facing, front):
+    """`front` is the normal that faces the traffic; else the box stands along x."""
+    around, rule = surroundings(route, scene=kerb_scene()), Roadside(facing=facing)
+    for seed in range(4):
+        (pose,) = draw([solid_box(*size)], around, seed, rule, route)
+        arc = route.project_numpy(pose.translation * [1, 1, 0]).arc_length
+        lane = route.heading_at(arc)[0]
+        way = np.array([np.cos(lane), np.sin(lane)])
+        normal = pose.rotation[:2, :2] @ (ALONG_X if front is None else front)
+        met = abs(normal @ way) if front is None else -normal @ way
+        assert np.degrees(np.arccos(min(met, 1.0))) <= 4.01
+
+
+def test_a_bus_is_no_board():
+    assert Shape.of(solid_box(*BOARD)).is_board
+    assert not any(Shape.of(solid_box(*size)).is_board for size in (CAR, BUS))
+
+
 @pytest.mark.parametrize(
     ("route", "rule"),
     [(straight(), Roadside()), (bent(), Roadside(((0.7, 3.0),)))],
@@ -251,4 +286,5 @@ test_no_room_and_rules_out_of_range_are_refused = refusals(
     (lambda: Roadside(scales=()), "Roadside.scales: none"),
     (lambda: Roadside(scales=((2.0, 1.0),)), "Roadside: 2.0 to 1.0"),
     (lambda: Roadside(view_px=0), "view_px: 0"),
+    (lambda: Roadside(facing="up"), "facing: 'up'; must be 'shape', 'along' or"),
 )
