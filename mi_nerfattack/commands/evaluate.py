@@ -62,9 +62,9 @@ class Evaluate:
     objects: tuple[int, ...] = (1,)
     """Numbers of objects, a case each; 0: no objects alone."""
     scale: tuple[float, ...] = ()
-    """Least and most factor to the size, of all or each --object."""
+    """Least and most factor to the size, of all or each object."""
     facing: Facing = "shape"
-    """Boards alone face the traffic, none, or all."""
+    """Boards face the traffic, none, or all."""
     seed: int = 1
     """Seed of starts, textures and images."""
     horizon: int = 1000

@@ -54,7 +54,7 @@ class Train:
     field: Path | None = None
     """Field file of the scene, for the surrogate."""
     object: tuple[Path, ...] = ()
-    """Grid fields beside the road; the bundled hydrant by default."""
+    """Grid fields beside the road; the bundled hydrant."""
     routes_file: Path | None = None
     """Routes file (.json); the preset's by default."""
     frames: dict[str, int] | None = None
@@ -84,7 +84,7 @@ class Train:
     dagger_epochs: int | None = None
     """Passes over all frames after a round."""
     validate_every: int = 4
-    """Epochs between two validations in the closed loop."""
+    """Epochs between validations by drives."""
     validate_in: tuple[str, ...] = ()
     """Their environments; all that are used by default."""
     runs: int = 2
