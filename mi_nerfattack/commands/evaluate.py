@@ -60,7 +60,7 @@ class Evaluate:
     runs: int = 20
     """Drives of each case, environment and route."""
     objects: tuple[int, ...] = (1,)
-    """Numbers of objects, a case each; 0: no objects alone."""
+    """Numbers of objects, a case each; 0: none."""
     scale: tuple[float, ...] = ()
     """Least and most factor to the size, of all or each object."""
     facing: Facing = "shape"

@@ -106,6 +106,7 @@ def _own(group: Sequence[Drive]) -> Drive:
     return next(drive for drive in group if drive.case == OWN)
 
 
+ATTRIBUTION = "attribution.json"
 #: The gradient of an attack on poses alone.
 UNCHANGED = "gradient by the unchanged texture"
 
@@ -185,7 +186,7 @@ def write_attribution(
         "gradient_norm": _columns(times.objects, found.norms),
         "gradient_share": _columns(times.objects, times.shares),
     }
-    files.write_json(folder / "attribution.json", data)
+    files.write_json(folder / ATTRIBUTION, data)
     plot_attribution(folder / "attribution.png", times, found.subject)
     pairs = zip(times.objects, fields, found.textures, strict=True)
     sides = {name: side_views(grid, g) for name, grid, g in pairs}

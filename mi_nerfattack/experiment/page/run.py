@@ -15,7 +15,7 @@ import numpy as np
 from mi_nerfattack.drives.store import read_drives
 from mi_nerfattack.drives.table import STEPS, read_csv, records
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.experiment.attribution import UNCHANGED
+from mi_nerfattack.experiment.attribution import ATTRIBUTION, UNCHANGED
 from mi_nerfattack.experiment.run_folder import (
     DRIVES,
     EFFORT,
@@ -40,7 +40,7 @@ from mi_nerfattack.report.pages.elements import (
 )
 from mi_nerfattack.report.plots.map import overhead
 from mi_nerfattack.report.plots.strip import turntable
-from mi_nerfattack.rollout.drive import ATTACK, Drive, Lane
+from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT, RANDOM, Drive, Lane
 from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.scenario.world import driven_route
 
@@ -209,13 +209,35 @@ def _seen(
         _pane(environment, case, own, steps, errors.get((environment, case), {}))
         for case, own in frames.items()
     ]
-    attacked = errors.get((environment, ATTACK), {})
-    far = [abs(attacked.get(step, (0.0, 0.0))[1]) for step in steps]
     last = (steps[-1] - steps[0]) / max(1, len(steps) - 1)
-    title = f"First drives in {environment}"
-    return Scrubber(
-        title, tuple(panes), int(np.argmax(far)), max(last * period_s, 0.05)
-    )
+    title, start = f"First drives in {environment}", _acting(folder, frames, steps)
+    return Scrubber(title, tuple(panes), start, max(last * period_s, 0.05))
+
+
+def _acting(
+    folder: Path, frames: Mapping[str, Mapping[int, Path]], steps: Sequence[int]
+) -> int:
+    """Find where the attack acts: the index of one of the control periods.
+
+    It has the largest share of the attack's gradient. Without an attribution, it is
+    where the attacked frame differs most from a frame of another case.
+    """
+    path = folder / ATTRIBUTION
+    if path.is_file():
+        by_object = files.read_json(path)["gradient_share"].values()
+        shares = np.sum(list(by_object), axis=0)
+        return int(np.argmax([shares[step : step + 1].sum() for step in steps]))
+    attacked = frames.get(ATTACK, {})
+    other = frames.get(RANDOM) or frames.get(NO_OBJECT, {})
+    return int(np.argmax([_difference(attacked.get(k), other.get(k)) for k in steps]))
+
+
+def _difference(one: Path | None, other: Path | None) -> float:
+    """Return the mean difference of two frames, 0 where one is missing."""
+    if one is None or other is None:
+        return 0.0
+    images = [files.read_image(path).astype(float) for path in (one, other)]
+    return float(np.abs(images[0] - images[1]).mean())
 
 
 def _frames(folder: Path, environment: str, case: str) -> dict[int, Path]:

@@ -17,7 +17,7 @@ from mi_nerfattack import cli
 from mi_nerfattack.experiment.page.run import read_run
 from mi_nerfattack.experiment.page.write import write_page
 from mi_nerfattack.io import files
-from mi_nerfattack.report.pages.elements import Parts
+from mi_nerfattack.report.pages.elements import SEEN, Parts
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -46,6 +46,8 @@ def decoded(address):
 def test_a_run_is_on_one_page(tmp_path):
     document = make_run(tmp_path / "run", frames=4)
     shutil.rmtree(tmp_path / "run" / "frames" / "surrogate_random")
+    shares = {"ball": [0.1, 0.1, 0.3, -0.2], "cone": [0.2, 0.1, 0.3, 0.1]}
+    files.write_json(tmp_path / "run/attribution.json", {"gradient_share": shares})
     parts = Parts(runs=[read_run(tmp_path / "run", "run")])
     write_page(tmp_path / "page.html", parts, tmp_path)
     page = files.read_text(tmp_path / "page.html")
@@ -73,13 +75,26 @@ def test_a_run_is_on_one_page(tmp_path):
     sheets = [i for i in reader.images if "frame by frame" in i["alt"]]
     assert [i["alt"].split(", ")[1] for i in sheets] == ["no object", "attack"]
     assert len(sizes) == len(PICTURES) + 2 + 1
-    # farthest out after 2 periods of 0.1 s, where the slider begins
+    # the attack acts most after 2 periods of 0.1 s, where the slider begins
     assert "0.2 s, -1.20 m</span>" in page and 'value="2"' in page
     for number, sheet in zip((0, 2), sheets, strict=True):
         pixels = decoded(sheet["src"])
         assert pixels.shape == (4 * 4, 8, 3)
         means = pixels.reshape(4, -1).mean(axis=1)
         np.testing.assert_allclose(means, 60 * number + 10 * np.arange(4), atol=3)
+
+
+@pytest.mark.parametrize("gone", ["", "random"])
+def test_without_an_attribution_the_slider_begins_where_frames_differ(tmp_path, gone):
+    make_run(tmp_path / "run", frames=4)
+    frames = tmp_path / "run" / "frames"
+    if gone:
+        shutil.rmtree(frames / f"surrogate_{gone}")
+    shutil.copy(
+        frames / "surrogate_attack/0003.png", frames / "surrogate_attack/0001.png"
+    )
+    (scrubber,) = read_run(tmp_path / "run", "run").scrubbers[SEEN]
+    assert scrubber.start == 1
 
 
 def test_several_runs_stand_side_by_side(tmp_path, page_of):
