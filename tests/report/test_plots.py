@@ -13,11 +13,13 @@ from support.worlds.places import write_place
 
 from mi_nerfattack.deploy.surrogate.scene import field_sensor
 from mi_nerfattack.drives.table import write_steps
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation import metrics
 from mi_nerfattack.fields.io import load_field
 from mi_nerfattack.io import files
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.report.plots import strip
+from mi_nerfattack.report.plots.charts import VARIABLE
 from mi_nerfattack.report.plots.convergence import convergence
 from mi_nerfattack.report.plots.drives import by_name, errors
 from mi_nerfattack.report.plots.map import overhead
@@ -189,3 +191,20 @@ def test_a_table_has_a_record_for_each_case():
     records = metrics_table({"routes": figures}).records
     found = [(row["environment"], row["case"]) for row in records]
     assert sorted(found) == sorted(names)
+
+
+def test_charts_are_vectors_too_where_the_variable_asks(tmp_path, monkeypatch):
+    history = [{"objective": -i, "cross_track_mean_m": 0.1 * i} for i in range(5)]
+    convergence(tmp_path / "a.png", history, None)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+    monkeypatch.setenv(VARIABLE, "pdf, svg")
+    for name in ("a.png", "b.png"):
+        convergence(tmp_path / name, history, None)
+    names = [f"{stem}.{kind}" for stem in "ab" for kind in ("pdf", "png", "svg")]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
+    for kind, start in (("pdf", b"%PDF"), ("svg", b"<?xml")):
+        one, other = ((tmp_path / f"{stem}.{kind}").read_bytes() for stem in "ab")
+        assert one == other and one.startswith(start)
+    monkeypatch.setenv(VARIABLE, "eps")
+    with pytest.raises(InputError, match=f"{VARIABLE}: 'eps'"):
+        convergence(tmp_path / "c.png", history, None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -80,6 +81,7 @@ def _retraining(path: Path) -> RetrainPart:
     return RetrainPart(path.name.removesuffix("-retrain.json"), document)
 
 
+_MOST_BYTES = 1 << 28  # of a plot
 #: Keys of `[attack.freedom]` that limit textures, and their largest values.
 _LIMITS = {"linf": 1.0, "l2": 1.0}
 
@@ -89,6 +91,9 @@ def write_page(
 ) -> None:
     """Write one HTML file, atomically.
 
+    Plots that were made in other formats, too, go to the folder ``NAME_plots`` next
+    to it.
+
     Args:
         path: of the file.
         parts: what it shows.
@@ -97,6 +102,14 @@ def write_page(
     """
     damage = {**_damage(scratch, parts), **_by_limit(scratch, parts)}
     write_results_page(path, title or _title(parts), replace(parts, damage=damage))
+    for sweep in parts.sweeps:
+        damage |= {f"{sweep.label} {key}": own for key, own in sweep.pictures.items()}
+    for key, picture in damage.items():
+        for plot in (picture.with_suffix(".pdf"), picture.with_suffix(".svg")):
+            if plot.is_file():
+                name = re.sub(r"[^A-Za-z0-9-]+", "_", key) + plot.suffix
+                folder = files.make_folder(path.with_name(f"{path.stem}_plots"))
+                files.write_bytes(folder / name, files.read_bytes(plot, _MOST_BYTES))
 
 
 def _title(parts: Parts) -> str:

@@ -1,8 +1,9 @@
-"""What charts share: width, fonts, colours, and writing them as PNG files."""
+"""What charts share: width, fonts, colours, and writing them to files."""
 
 from __future__ import annotations
 
 import io
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,8 +13,13 @@ import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 
+#: Environment variable with formats in which charts are written next to the PNG files.
+VARIABLE = "MI_NERFATTACK_PLOTS"
+#: Formats with the metadata that would differ between equal charts.
+_VECTOR = {"pdf": "CreationDate", "svg": "Date"}
 WIDTH_PX = 1200
 DPI = 150
 #: After Okabe and Ito 2008.
@@ -28,6 +34,8 @@ RC: Any = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "savefig.facecolor": "white",
+    "pdf.fonttype": 42,  # TrueType, as journals ask
+    "svg.hashsalt": "mi_nerfattack",  # equal charts are equal files
 }
 
 
@@ -52,8 +60,18 @@ def blank(size_in: tuple[float, float], dpi: float) -> Iterator[Figure]:
 
 
 def save(path: str | Path, figure: Figure) -> None:
-    """Write a figure as PNG, atomically."""
+    """Write a figure as PNG, and in the formats of `VARIABLE`, atomically.
+
+    Raises:
+        InputError: the variable names another format.
+    """
     files.write_bytes(path, png(figure))
+    for suffix in os.environ.get(VARIABLE, "").replace(",", " ").split():
+        if suffix not in _VECTOR:
+            raise InputError(f"{VARIABLE}: {suffix!r}; must be pdf, svg, or both")
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format=suffix, metadata={_VECTOR[suffix]: None})
+        files.write_bytes(Path(path).with_suffix(f".{suffix}"), buffer.getvalue())
 
 
 def png(figure: Figure) -> bytes:

@@ -127,6 +127,18 @@ def test_several_runs_stand_side_by_side(tmp_path, page_of):
     assert f"attack {folder / 'scenario.toml'} -o {folder}" in reader.text
 
 
+def test_plots_of_a_page_are_vectors_next_to_it(tmp_path, page_of, monkeypatch):
+    for name in ("one", "two"):
+        make_run(tmp_path / name, pictures=False)
+    page_of("one", "two")
+    assert not (tmp_path / "page_plots").exists()
+    monkeypatch.setenv("MI_NERFATTACK_PLOTS", "pdf")
+    page_of("one", "two")
+    assert [path.name for path in (tmp_path / "page_plots").iterdir()] == [
+        "Damage_against_frames_straight.pdf"
+    ]
+
+
 def test_transfers_and_retrainings_are_tables(tmp_path, page_of):
     make_transfer(tmp_path / "moved")
     make_retraining(tmp_path / "better-retrain.json")
