@@ -203,6 +203,7 @@ def started(pose=(0.0, 0.0, 0.0), speed=5.0, control=0.0):
 test_bad_input_is_refused = refusals(
     (lambda: MujocoVehicle(CAR, period=0.0333), "physics timestep"),
     (lambda: MujocoVehicle(CAR, period=0.0), "period"),
+    (lambda: MujocoVehicle(replace(CAR, control_unit="other")), "unit: 'other'; a car"),
     (lambda: MujocoVehicle(CAR, timestep=0.01), "timestep: 0.01"),
     # 2.7 m / tan(u) is half the track of 1.55 m at 1.291 rad
     (lambda: MujocoVehicle(replace(CAR, max_steer=1.25)), "car.max_steer: .* 1.241"),

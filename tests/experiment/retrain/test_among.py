@@ -21,6 +21,7 @@ from mi_nerfattack.experiment.retrain.among import (
     found_place,
 )
 from mi_nerfattack.experiment.retrain.anew import attack_anew
+from mi_nerfattack.experiment.retrain.solvable import drive_expert
 from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.fields import GridField, load_grid, save_field
 from mi_nerfattack.io import locks
@@ -143,6 +144,40 @@ def test_runs_of_other_places_are_refused(found, tmp_path):
     other = read(path, tmp_path / "run0", 0 * SHIFT, 3)
     with pytest.raises(InputError, match=r"vehicle.dt_s: 0.2 -> 0.1\n"):
         found_place([found[0], other])
+
+
+CAR = """\
+import drjit as dr
+
+def car(state, control):
+    theta = state[2]
+    return 5 * dr.cos(theta), 5 * dr.sin(theta), control
+"""
+CUSTOM = """\
+[vehicle]
+kind = "custom"
+function = "car.py:car"
+trust_code = true
+control_limit = 1.5
+"""
+
+
+def test_an_expert_drives_a_vehicle_whose_control_it_knows(found, tmp_path):
+    """It drives the function of a Dubins vehicle as it drives that vehicle."""
+    path = tmp_path / "scenario.toml"
+    shutil.copytree(found[0].folder.parent, tmp_path, dirs_exist_ok=True)
+    (tmp_path / "car.py").write_text(CAR)
+    text, driven = path.read_text(), []
+    for vehicle in ("", f'{CUSTOM}control_unit = "rad/s"\n', CUSTOM):
+        path.write_text(text.replace("[drive]", f"{vehicle}[drive]"))
+        run = read(path, tmp_path / "run0", 0 * SHIFT, 3)
+        if vehicle == CUSTOM:
+            with pytest.raises(InputError, match="vehicle.control_unit: "):
+                drive_expert(run)
+        else:
+            driven.append(drive_expert(run))
+    one, other = driven
+    assert other.error_m == pytest.approx(one.error_m, abs=1e-6)
 
 
 def test_a_second_process_is_refused_before_it_attacks_anew(tmp_path):
