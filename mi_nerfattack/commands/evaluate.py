@@ -142,6 +142,7 @@ class Evaluate:
         """Check everything that can be checked before the first drive."""
         from mi_nerfattack.drives.store import Store
         from mi_nerfattack.evaluation.work import EvaluateDrives, check_policy
+        from mi_nerfattack.scenario.section import misfit
         from mi_nerfattack.scenario.world import at_own_speed
 
         file = PolicyFile.read(self.policy, self.settings)
@@ -157,8 +158,8 @@ class Evaluate:
             settings = replace(settings, car_width_m=place.car.width)
         vehicle = file.vehicle
         taken = place.car.control_unit if vehicle is None else vehicle.unit
-        if misfit := section.misfit(taken):
-            raise InputError(f"policy: the car of the place {misfit}")
+        if reason := misfit(section.unit(), taken, section.source):
+            raise InputError(f"policy: the car of the place {reason}")
         check_policy(section.build(), place, routes)
         store = Store(self.drives)
         return EvaluateDrives(store, section, place, under, routes, settings, vehicle)

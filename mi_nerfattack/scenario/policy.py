@@ -136,20 +136,6 @@ class AbstractPolicySection(Section):
         """Return the unit of the control; None where nothing says it."""
         return self.control_unit
 
-    def misfit(self, taken: str | None) -> str:
-        """Say why a vehicle does not take the control; nothing if it may.
-
-        Args:
-            taken: unit of the vehicle's control; None where nothing says it.
-        """
-        given = self.unit()
-        if None in (given, taken) or given == taken:
-            return ""
-        return (
-            f"takes {taken}, and {self.source} gives {given}; take another of them, or "
-            "convert the control by policy.control_scale"
-        )
-
     @abstractmethod
     def build(self) -> AbstractPolicy:
         """Make the policy.
@@ -319,11 +305,8 @@ class CallableSection(AbstractPolicySection):
 
     def build(self) -> AbstractPolicy:
         """Load the function."""
-        preprocess = self.preprocess.build()
-        function, scale = (
-            self.file.load("policy.file", self.trust_code),
-            self.control_scale,
-        )
+        preprocess, scale = self.preprocess.build(), self.control_scale
+        function = self.file.load("policy.file", self.trust_code)
         return CallablePolicy(function, self.source, preprocess, scale, self.output)
 
 

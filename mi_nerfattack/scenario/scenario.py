@@ -38,6 +38,7 @@ from mi_nerfattack.scenario.policy import PolicySection, build_differentiable
 from mi_nerfattack.scenario.section import (
     CameraSection,
     Section,
+    misfit,
     problems,
     refuse,
     tell,
@@ -265,8 +266,9 @@ class Scenario(Section):
                         f"{label}: {kind} drives a car with wheels, whose control is "
                         "not that of a custom vehicle; take mitsuba",
                     )
-        if misfit := self.policy.misfit(self.vehicle.unit):
-            refuse("vehicle.kind", f"{model} {misfit}")
+        policy, taken = self.policy, self.vehicle.unit
+        if reason := misfit(policy.unit(), taken, policy.source):
+            refuse("vehicle.kind", f"{model} {reason}")
         return self
 
     def _check_placed(self) -> None:

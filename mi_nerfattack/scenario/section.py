@@ -328,6 +328,22 @@ def _line_of(text: str, location: Location) -> int | None:
     return tomlkit.dumps(document).partition(_MARK)[0].count("\n") + 1
 
 
+def misfit(given: str | None, taken: str | None, source: str) -> str:
+    """Say why a vehicle does not take a policy's control; nothing if it may.
+
+    Args:
+        given: unit of the policy's control; None where nothing says it.
+        taken: unit of the vehicle's, likewise.
+        source: of the policy, for the message.
+    """
+    if None in (given, taken) or given == taken:
+        return ""
+    return (
+        f"takes {taken}, and {source} gives {given}; take another of them, or convert "
+        "the control by policy.control_scale"
+    )
+
+
 class CameraSection(Section):
     """The camera on the vehicle."""
 

@@ -96,12 +96,14 @@ class PolicyFile:
         Raises:
             InputError: the policy's file and the section [vehicle] differ.
         """
+        from mi_nerfattack.scenario.section import misfit
+
         section, vehicle = self.section, self.vehicle
         if vehicle is None or not vehicle.has_expert:
             unit = section.unit()
             return None if unit == "other" else unit, None
-        if misfit := section.misfit(vehicle.unit):
-            raise InputError(f"{self.name}: vehicle.kind: this one {misfit}")
+        if reason := misfit(section.unit(), vehicle.unit, section.source):
+            raise InputError(f"{self.name}: vehicle.kind: this one {reason}")
         wheelbase_m = round(vehicle.car().wheelbase, 6)
         return vehicle.unit, wheelbase_m if vehicle.unit == "rad" else None
 
