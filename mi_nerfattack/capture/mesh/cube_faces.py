@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.backend.colour import straight_rgba
-from mi_nerfattack.capture.mesh.mesh import CUBE_FACES
+from mi_nerfattack.capture.mesh.mesh import CUBE_FACES, TexturedMesh, cube_mesh
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.io import files
@@ -26,6 +26,8 @@ _RIM_PX = 3
 _FLAT_VOXELS = 5  # how far a fitted surface lies from the object's
 OBJECT_BOX = ("provenance.object_lower", "provenance.object_upper")
 """Header entries of the box of the object that a field was fitted to."""
+FLAT = "provenance.flat"
+"""Header entry of a thin sheet's field: which kind of `FlatObject` the sheet is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +67,15 @@ def object_box(field: GridField) -> tuple[np.ndarray, np.ndarray]:
             f"header entries {', '.join(OBJECT_BOX)}: {lower} to {upper}; no box"
         )
     return lower, upper
+
+
+def sheet_mesh(field: GridField) -> TexturedMesh | None:
+    """Return the box of a flat object; None for fields of other objects."""
+    if FLAT not in field.info:
+        return None
+    lower, upper = object_box(field)
+    offset = [*(lower + upper)[:2] / 2, lower[2]]
+    return cube_mesh(1.0).placed(np.diag(upper - lower), np.array(offset))
 
 
 def render_faces(field: GridField, pixels_per_m: float | None = None) -> CubeFaces:
