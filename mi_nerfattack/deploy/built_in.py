@@ -103,8 +103,8 @@ def make_built_in(
         field: the object, as attacked.
         pose: object to world.
         mesh: the object's own geometry (glTF, OBJ, PLY), which the field was fitted
-            to; None for the surface of the field, as `export` extracts it, or for the
-            box of a flat object.
+            to; None for the surface of the field, as `export` extracts it, or the face
+            of a flat object.
         placement: size and axes of the mesh that were given to `asset`.
         captured_irradiance: E, in the field's unit of radiance times steradian; pi,
             the default, takes radiance as albedo.

@@ -11,12 +11,12 @@ from scipy.ndimage import distance_transform_edt
 
 from mi_nerfattack.capture.mesh.cube_faces import (
     FLAT,
+    FLAT_FACES,
     CubeFaces,
     flat_share,
     object_box,
     render_faces,
 )
-from mi_nerfattack.capture.mesh.flat import KINDS
 from mi_nerfattack.capture.mesh.mesh import CUBE_FACES
 from mi_nerfattack.drives.store import read_drives
 from mi_nerfattack.errors import InputError
@@ -167,7 +167,7 @@ def read_box(
     lower, upper, images = box_pictures(field, texture_px)
     sheet = None
     if FLAT in field.info:
-        (sheet,) = (k for k, v in FACES.items() if v == KINDS[field.info[FLAT]])
+        (sheet,) = (k for k, v in FACES.items() if v == FLAT_FACES[field.info[FLAT]])
     box = AttackedBox(
         name=boxes[0],
         run=found.label,

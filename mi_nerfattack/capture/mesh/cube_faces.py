@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.backend.colour import straight_rgba
-from mi_nerfattack.capture.mesh.mesh import CUBE_FACES, TexturedMesh, cube_mesh
+from mi_nerfattack.capture.mesh.mesh import CUBE_FACES, MeshPart, TexturedMesh
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.io import files
@@ -27,7 +27,9 @@ _FLAT_VOXELS = 5  # how far a fitted surface lies from the object's
 OBJECT_BOX = ("provenance.object_lower", "provenance.object_upper")
 """Header entries of the box of the object that a field was fitted to."""
 FLAT = "provenance.flat"
-"""Header entry of a thin sheet's field: which kind of `FlatObject` the sheet is."""
+"""Header entry of the field of a flat object: its kind."""
+FLAT_FACES = {"billboard": "ny", "patch": "pz"}
+"""Which face of the box shows the picture, as `CUBE_FACES` names it, by kind."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,12 +72,23 @@ def object_box(field: GridField) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sheet_mesh(field: GridField) -> TexturedMesh | None:
-    """Return the box of a flat object; None for fields of other objects."""
-    if FLAT not in field.info:
+    """Return the face of a flat object that shows the picture; None for other fields.
+
+    Raises:
+        InputError: the field's header names no kind of flat object.
+    """
+    kind = field.info.get(FLAT)
+    if kind is None:
         return None
-    lower, upper = object_box(field)
-    offset = [*(lower + upper)[:2] / 2, lower[2]]
-    return cube_mesh(1.0).placed(np.diag(upper - lower), np.array(offset))
+    if kind not in FLAT_FACES:
+        raise InputError(
+            f"header entry '{FLAT}' is {kind!r}; allowed: {', '.join(FLAT_FACES)}"
+        )
+    normal, right, up = np.array(CUBE_FACES[FLAT_FACES[kind]], np.float64)
+    sides = np.array([-right - up, right - up, right + up, -right + up])
+    middle, half = (field.lower + field.upper) / 2, (field.upper - field.lower) / 2
+    part = MeshPart(middle + half * (normal + sides), np.array([[0, 1, 2], [0, 2, 3]]))
+    return TexturedMesh(kind, (part,))
 
 
 def render_faces(field: GridField, pixels_per_m: float | None = None) -> CubeFaces:

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import numpy as np
 from PIL import Image
 
-from mi_nerfattack.capture.mesh.cube_faces import FLAT
+from mi_nerfattack.capture.mesh.cube_faces import FLAT, FLAT_FACES
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField, GridLayout
 from mi_nerfattack.fields.occupancy import Occupancy
 
 #: Pixels along an edge, at most: the lattice of a grid field is a cube.
 MOST_PIXELS = 256
-#: Which face of the box shows the picture, as `CUBE_FACES` names it, by kind.
-KINDS: Mapping[str, str] = MappingProxyType({"billboard": "ny", "patch": "pz"})
 
 _THICKNESS = 0.01  # of the box, of its longer edge
 _STEPS = 8  # of the march, through the sheet at right angles
@@ -34,7 +30,7 @@ class FlatObject:
     both upright. The other side of the sheet shows the picture mirrored.
 
     Args:
-        kind: one of `KINDS`.
+        kind: one of `FLAT_FACES`.
         width_m: along x.
         height_m: of the picture: along z (billboard) or y (patch).
         pixels_per_m: resolution along the longer edge. The other edge has as many
@@ -51,8 +47,8 @@ class FlatObject:
     pixels_per_m: float = 32.0
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise InputError(f"kind: {self.kind!r}; one of {', '.join(KINDS)}")
+        if self.kind not in FLAT_FACES:
+            raise InputError(f"kind: {self.kind!r}; one of {', '.join(FLAT_FACES)}")
         for name in ("width_m", "height_m", "pixels_per_m"):
             if not 0 < getattr(self, name) < np.inf:
                 raise InputError(

@@ -52,8 +52,8 @@ def field_surface(field: GridField) -> ColouredMesh:
 
     Marching cubes over the opacity of one voxel, `1 - exp(-density voxel)`, at the
     field's finest resolution, at 0.5. Pinholes are closed and hollows that nobody
-    sees filled, specks below a thousandth of the largest part left out. A flat object
-    has the surface of its box.
+    sees filled, specks below a thousandth of the largest part left out. The
+    surface of a flat object is the face that shows its picture.
 
     Args:
         field: the object.

@@ -12,7 +12,8 @@ from support.faults.refusals import refusals
 from mi_nerfattack import cli
 from mi_nerfattack.backend.arrays import upload_rows
 from mi_nerfattack.backend.colour import srgb_to_linear_numpy
-from mi_nerfattack.capture.mesh.flat import KINDS, FlatObject
+from mi_nerfattack.capture.mesh.cube_faces import FLAT_FACES
+from mi_nerfattack.capture.mesh.flat import FlatObject
 from mi_nerfattack.capture.mesh.surface import field_surface
 from mi_nerfattack.deploy.built_in import make_built_in
 from mi_nerfattack.fields import load_grid, save_field
@@ -60,7 +61,7 @@ def look(field, points: np.ndarray):
     return march(PosedField(field, POSE), Rays(origin, direction)), length
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FLAT_FACES)
 def test_a_driver_sees_the_picture_upright(kind):
     rng = np.random.default_rng(0)
     shares = rng.uniform(0.05, 0.45, (40, 2)) + 0.5 * rng.integers(2, size=(40, 2))
@@ -74,14 +75,14 @@ def test_a_driver_sees_the_picture_upright(kind):
     np.testing.assert_allclose(depth, length, atol=2e-3)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FLAT_FACES)
 def test_beside_the_sheet_is_nothing(kind):
     beyond = np.array([[-0.01, 0.5], [1.01, 0.5], [0.5, -0.01], [0.5, 1.01]])
     seen, _ = look(made(kind), on_sheet(kind, *beyond.T))
     assert not seen.opacity.numpy().any()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FLAT_FACES)
 def test_size_and_picture_stay_in_the_file(tmp_path, kind):
     size = (WIDTH, 0.02, HEIGHT) if kind == "billboard" else (WIDTH, HEIGHT, 0.02)
     before = made(kind)
@@ -93,34 +94,31 @@ def test_size_and_picture_stay_in_the_file(tmp_path, kind):
     colours = [look(field, points)[0].radiance.numpy() for field in (before, after)]
     np.testing.assert_allclose(*colours, rtol=2e-3)
     mesh = field_surface(after)
-    np.testing.assert_allclose(np.ptp(mesh.vertices, 0), size, atol=1e-9)
+    corners = on_sheet(kind, np.array([0.0, 1.0]), np.array([1.0, 0.0]))
+    np.testing.assert_allclose(mesh.vertices.min(0), corners[0], atol=1e-9)
+    np.testing.assert_allclose(mesh.vertices.max(0), corners[1], atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FLAT_FACES)
 def test_built_in_the_sheet_has_the_albedo_of_the_picture(kind):
     found = make_built_in(made(kind), POSE)
-    np.testing.assert_allclose(np.ptp(found.vertices, 0), np.ptp(bounds(kind), 0))
+    edges = on_sheet(kind, np.array([0.0, 1.0]), np.array([1.0, 0.0]))
+    np.testing.assert_allclose(found.vertices.min(0), edges[0], atol=1e-9)
+    np.testing.assert_allclose(found.vertices.max(0), edges[1], atol=1e-9)
+    assert len(found.faces) == 2
     height, width, _ = found.image.shape
-    corners = found.vertices[found.faces]
-    uv = found.uv[found.faces]
-    middles = corners.mean(1)
-    axis = 1 if kind == "billboard" else 2
-    level = 0.0 if kind == "billboard" else 0.01 * WIDTH
-    for row in np.flatnonzero(np.ptp(corners[..., axis], 1) < 1e-9):
-        if abs(middles[row, axis] - level) > 1e-9:
-            continue
-        # a point of each triangle that lies inside of one quarter
-        weights = np.array([0.7, 0.15, 0.15])
-        point, (u, v) = weights @ corners[row], weights @ uv[row]
+    up_axis, weights = 2 if kind == "billboard" else 1, np.array([0.7, 0.15, 0.15])
+    for face in found.faces:
+        corners, uv = found.vertices[face], found.uv[face]
+        normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+        assert normal @ (EYE - corners[0]) > 0
+        # a point of the triangle that lies inside of one quarter
+        point, (u, v) = weights @ corners, weights @ uv
         texel = found.image[int((1 - v) * height), int(u * width)]
-        other = point[2] if kind == "billboard" else point[1] + HEIGHT / 2
-        quarter = QUARTERS[int(other < HEIGHT / 2), int(point[0] > 0)]
+        middle = (edges[0] + edges[1])[up_axis] / 2
+        is_low = point[up_axis] < middle
+        quarter = QUARTERS[int(is_low), int(point[0] > 0)]
         np.testing.assert_allclose(texel, quarter, atol=3)
-
-
-def bounds(kind: str) -> np.ndarray:
-    field = made(kind)
-    return np.stack([field.lower, field.upper])
 
 
 def test_resolution_counts_pixels_of_the_longer_edge():
