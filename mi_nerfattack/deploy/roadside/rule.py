@@ -42,7 +42,7 @@ class Roadside:
     occupied box is at least 1.5 times as long as wide stands along the road to 4
     degrees, either way round; others at any angle. A board, which is thinner than a
     quarter of its width and of its height, faces the traffic on the route to 4 degrees
-    instead: by the wider of its +x and +y sides. Each is seen from a drive along the
+    instead: by the wider of its -x and -y sides. Each is seen from a drive along the
     lane's centre: in frames of `view_s` together, not necessarily in a row, about
     `view_px` pixels or more show a part of it that neither the scene nor another object
     hides, as 64 of its points tell.
@@ -154,10 +154,8 @@ class Roadside:
         back = np.pi * rng.integers(2, size=_TRIES)
         faces = self.facing == "traffic" or self.facing == "shape" and shape.is_board
         is_along = shape.is_long and not faces
-        if faces:  # the side along +x is the wider one of a box that is thin along x
-            turn = _ALONG * turn + (
-                np.pi if shape.size[0] < shape.size[1] else np.pi / 2
-            )
+        if faces:  # the traffic drives along +x of a box that is thin along x
+            turn = _ALONG * turn - (shape.size[0] >= shape.size[1]) * np.pi / 2
         elif is_along:
             turn = _ALONG * turn + back + (shape.size[0] < shape.size[1]) * np.pi / 2
         else:

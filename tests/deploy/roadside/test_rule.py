@@ -20,6 +20,7 @@ from support.worlds.places import (
 )
 
 from mi_nerfattack.attack.base import Freedom
+from mi_nerfattack.capture.mesh.flat import FlatObject
 from mi_nerfattack.deploy.roadside.footprint import Shape, Stands
 from mi_nerfattack.deploy.roadside.rule import Roadside
 from mi_nerfattack.deploy.roadside.surroundings import Surroundings
@@ -180,13 +181,13 @@ BOARD, CAR, BUS = (3.0, 0.2, 2.0), (4.2, 1.8, 1.5), (12.0, 2.5, 3.0)
 @pytest.mark.parametrize(
     ("size", "facing", "front"),
     [
-        (BOARD, "shape", ALONG_Y),
-        ((0.2, 3.0, 2.0), "shape", ALONG_X),
+        (BOARD, "shape", -ALONG_Y),
+        ((0.2, 3.0, 2.0), "shape", -ALONG_X),
         (BOARD, "along", None),
         (CAR, "shape", None),
-        (CAR, "traffic", ALONG_Y),
+        (CAR, "traffic", -ALONG_Y),
         ((4.0, 0.5, 0.4), "shape", None),  # flat on the ground
-        ((1.0, 1.0, 1.0), "traffic", ALONG_Y),
+        ((1.0, 1.0, 1.0), "traffic", -ALONG_Y),
     ],
 )
 def test_which_way_an_object_faces(route, size, facing, front):
@@ -203,6 +204,8 @@ def test_which_way_an_object_faces(route, size, facing, front):
 
 
 def test_a_bus_is_no_board():
+    board, patch = (FlatObject(x, 3.0, 2.0).field() for x in ("billboard", "patch"))
+    assert Shape.of(board).is_board and not Shape.of(patch).is_board
     assert Shape.of(solid_box(*BOARD)).is_board
     assert not any(Shape.of(solid_box(*size)).is_board for size in (CAR, BUS))
 
@@ -280,7 +283,7 @@ def narrow() -> mi.Scene:
 
 
 test_no_room_and_rules_out_of_range_are_refused = refusals(
-    (stood(empty), "no cell of its field"),
+    (stood(empty), "no cell is occupied"),
     (stood(lambda: solid_box(9.0, 9.0, 3.0), narrow), "fewer or other sizes"),
     (stood(small_grid, walled, gap_m=(2.0, 2.5)), "'straight': .* 0 of 1.* 0.0 to 38"),
     (lambda: Roadside(scales=()), "Roadside.scales: none"),
