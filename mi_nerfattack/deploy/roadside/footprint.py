@@ -58,6 +58,11 @@ class Shape:
         return bool(self.size[:2].max() >= _LONG * self.size[:2].min())
 
     @property
+    def is_patch(self) -> bool:
+        """Whether it lies on the lane."""
+        return bool(self.size[2] < _FLAT * self.size[:2].min())
+
+    @property
     def is_board(self) -> bool:
         """Whether it faces the traffic, as a billboard does."""
         thickness, width = sorted(self.size[:2])

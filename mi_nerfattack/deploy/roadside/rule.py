@@ -42,10 +42,12 @@ class Roadside:
     occupied box is at least 1.5 times as long as wide stands along the road to 4
     degrees, either way round; others at any angle. A board, which is thinner than a
     quarter of its width and of its height, faces the traffic on the route to 4 degrees
-    instead: by the wider of its -x and -y sides. Each is seen from a drive along the
-    lane's centre: in frames of `view_s` together, not necessarily in a row, about
-    `view_px` pixels or more show a part of it that neither the scene nor another object
-    hides, as 64 of its points tell.
+    instead: by the wider of its -x and -y sides. A patch, which is lower than a quarter
+    of its length and of its width, lies on the lane of the route instead, where the
+    lane is as good as straight, +y along the lane to 4 degrees. Each is seen from a
+    drive along the lane's centre: in frames of `view_s` together, not necessarily in a
+    row, about `view_px` pixels or more show a part of it that neither the scene nor
+    another object hides, as 64 of its points tell.
 
     Args:
         scales: range of the factor to the natural size, of each object in turns.
@@ -144,7 +146,7 @@ class Roadside:
         stretch: tuple[float, float],
         rng: np.random.Generator,
     ) -> Stands:
-        """Draw places beside the road; those without ground drop out."""
+        """Draw places beside the road, or on the lane; without ground, none."""
         scale = rng.uniform(*scales, _TRIES)
         ahead = _AHEAD_S * route.speed_ms
         arc = rng.uniform(stretch[0], stretch[1] + ahead, _TRIES)
@@ -153,8 +155,10 @@ class Roadside:
         turn = rng.uniform(-1, 1, _TRIES)
         back = np.pi * rng.integers(2, size=_TRIES)
         faces = self.facing == "traffic" or self.facing == "shape" and shape.is_board
-        is_along = shape.is_long and not faces
-        if faces:  # the traffic drives along +x of a box that is thin along x
+        is_along = shape.is_patch or shape.is_long and not faces
+        if shape.is_patch:  # the traffic drives along +y
+            turn = _ALONG * turn - np.pi / 2
+        elif faces:  # the traffic drives along +x of a box that is thin along x
             turn = _ALONG * turn - (shape.size[0] >= shape.size[1]) * np.pi / 2
         elif is_along:
             turn = _ALONG * turn + back + (shape.size[0] < shape.size[1]) * np.pi / 2
@@ -162,7 +166,11 @@ class Roadside:
             turn *= np.pi
         half = scale[:, None] * shape.size[:2] / 2
         reach = half[:, 0] * np.abs(np.sin(turn)) + half[:, 1] * np.abs(np.cos(turn))
-        lateral = surroundings.kerb(route, arc, side) + gap + reach
+        if shape.is_patch:
+            free = np.maximum(route.lane_width_m / 2 - reach, 0)
+            lateral = free * rng.uniform(size=_TRIES)
+        else:
+            lateral = surroundings.kerb(route, arc, side) + gap + reach
         known = np.isfinite(lateral)
         if is_along:
             ends = arc + half.max(1) * [[-1.0], [1.0]]
@@ -179,14 +187,18 @@ class Roadside:
     def _free(
         self, stands: Stands, surroundings: Surroundings, placed: Sequence[Stands]
     ) -> Stands:
-        """Keep what stands off the lanes, on free ground, clear of other objects."""
+        """Keep what stands on free ground, clear of other objects.
+
+        All but patches stand off the lanes.
+        """
         for other in placed:
             stands = stands[stands.apart(other, self.clearance_m)]
         if not len(stands):
             return stands
         step = float(min(0.1, stands.half.min() / 2))
-        outline = stands.lattice(5 * step)
-        stands = stands[~surroundings.on_lanes(outline, self.gap_m[0])]
+        if not stands.shape.is_patch:
+            outline = stands.lattice(5 * step)
+            stands = stands[~surroundings.on_lanes(outline, self.gap_m[0])]
         if not len(stands):
             return stands
         return stands[surroundings.stand_free(stands, step, self.clearance_m)]
