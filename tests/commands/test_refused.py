@@ -114,6 +114,10 @@ evaluate damaged.safetensors @place --page out => damaged.json
 evaluate car.toml @place => the car of the place takes rad, .* gives rad/s
 evaluate angle.toml @place => the car of the place takes rad/s, .* gives rad;
 evaluate lag.toml @place => lag.toml: vehicle.lag: unknown key
+evaluate flat.toml --environments mitsuba => objects.0: a flat object without a file
+asset flat patch --width-m 1 --height-m 4 -o a.npz => ends in .safetensors
+asset flat patch --width-m 1 --height-m 0 -o a.safetensors => height_m: 0
+asset flat patch --width-m 1 --height-m 1 --picture no.png -o a.safetensors => no.png
 evaluate camera.toml @place => camera.toml: camera.width: .*greater
 evaluate custom.toml @place --environments mujoco => mujoco drives a car with wheels
 evaluate --place room --environments mitsuba => the car .* takes rad, .* gives rad/s
@@ -147,6 +151,21 @@ export faces good.safetensors -o out.glb => give a folder's name
 fit empty -o f.safetensors => no posed images; looked for transforms.json
 fit posed -o f.safetensors => transforms.json: 1 of 3 frames have no image, first './i
 """
+FLAT = """\
+name = "flat"
+policy.file = "bundled:policy/pilotnet.safetensors"
+[scene]
+field = "bundled:intersection/field.safetensors"
+deployment = "bundled:intersection/scene.xml"
+routes = "bundled:intersection/routes.json"
+route = "right"
+[[objects]]
+kind = "patch"
+id = "patch"
+width_m = 1
+height_m = 2
+position_m = [0, 0, 0]
+"""
 NAN = """\
 from torch import nn
 class Bad(nn.Module):
@@ -169,6 +188,7 @@ TEXTS = {
     "noise.bin": "noise",
     "token": "short",
     "noise.safetensors": "noise",
+    "flat.toml": FLAT,
     "empty.toml": "[scene]\n",
     "key.toml": '[policy]\nfile = "still.py:drive"\ncolour = "red"\n',
     "table.toml": '[policy]\nfile = "a.pt2"\n[vehicles]\n',

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -130,14 +130,13 @@ class PolicyFile:
             field = None if scene.field is None else scene.field.file
             if field and holds_splats(field):
                 field = None
-            fields = [item.named for item in self.scenario.objects]
             place = replace(
                 place,
                 scene=scene.deployment.file,
                 field=field,
                 field_pose=None if scene.to_world is None else scene.pose,
                 routes=scene.routes.file,
-                objects=tuple(item.file for item in fields if item is not None),
+                objects=tuple(self._object_files()),
             )
         if self.camera is not None:
             place = replace(place, camera=self.camera[0], mount=self.camera[1])
@@ -145,6 +144,22 @@ class PolicyFile:
             car, period = self.vehicle.car(), self.vehicle.dt_s
             place = replace(place, car=car, period=period)
         return place
+
+    def _object_files(self) -> Iterator[Path]:
+        """Yield the field files of the scenario's objects.
+
+        Raises:
+            InputError: an object has none.
+        """
+        assert self.scenario is not None
+        for index, item in enumerate(self.scenario.objects):
+            if item.named is None:
+                raise InputError(
+                    f"objects.{index}: a flat object without a file; places are drawn "
+                    "for files: write one with 'mi-nerfattack asset flat', and name it "
+                    "as field"
+                )
+            yield item.named.file
 
 
 def read_camera(name: str) -> tuple[Camera, CameraMount]:

@@ -141,8 +141,13 @@ def _iteration(world: World) -> tuple[float, float, float, float]:
 
 
 def _field_bytes(world: World) -> int:
-    named = [item.named for item in world.scenario.objects]
-    return sum(item.file.stat().st_size for item in named if item is not None)
+    total = 0
+    for item, field in zip(world.scenario.objects, world.fields, strict=True):
+        if item.named is None:
+            total += sum(tensor.nbytes for tensor in field.tensors().values())
+        else:
+            total += item.named.file.stat().st_size
+    return total
 
 
 def _kept_mb(world: World) -> float:
