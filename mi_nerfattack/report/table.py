@@ -39,7 +39,9 @@ def metrics_table(document: Document) -> Table:
     """Return the figures of a run: a row for each route, environment and case."""
     mean, largest = _FIGURES
     figures = [
-        *(Column("runs", "n"), mean),
+        Column("runs", "n"),
+        *_objective(document),
+        mean,
         Column("95 % (m)", "cross_track_mean_ci95_m", terminal=False),
         largest,
         Column("wheel out (s)", "wheel_out_s", 2, short="wheel\nout (s)"),
@@ -51,6 +53,13 @@ def metrics_table(document: Document) -> Table:
         "bootstrap over them; cases of one look have none, since their runs differ in "
         "the start alone. Times are means over the runs; departed runs had a wheel out."
     )
+    if (objective := document.get("objective")) is not None:
+        caption += (
+            f" The objective, {objective['name']}, is that of a drive, mean over the "
+            "runs; the attack makes it smaller."
+        )
+        for name, why in objective["missing"].items():
+            caption += f" It has no value in {name}: {why}."
     labels = [_ROUTE, _ENVIRONMENT, _CASE]
     return Table(_TITLE, labels, figures, list(_cases(document)), caption=caption)
 
@@ -58,7 +67,7 @@ def metrics_table(document: Document) -> Table:
 def runs_table(document: Document) -> Table:
     """Return every drive of a run: a row each."""
     figures = [
-        *(Column("run", "run"), *_FIGURES),
+        *(Column("run", "run"), *_objective(document), *_FIGURES),
         Column("wheel out (s)", "wheel_out_s", 2, bad=True),
         Column("centre out (s)", "centre_out_s", 2, bad=True),
         Column("back at (s)", "returned_s", 1),
@@ -262,6 +271,17 @@ def attacks_table(rows: Sequence[dict[str, Any]]) -> Table:
         Column("environment", _where),
     ]
     return Table(_MEAN, labels, figures, rows, caption=caption)
+
+
+def _objective(document: Document) -> list[Column]:
+    """Return the objective's column, unless it is the distance from the lane centre."""
+    if document.get("objective") is None:
+        return []
+    return [Column("objective", lambda row: _significant(row["objective"]))]
+
+
+def _significant(value: float | None) -> Cell:
+    return Cell("–" if value is None else f"{value:.4g}")
 
 
 def _cases(document: Document) -> Iterator[dict[str, Any]]:
