@@ -166,25 +166,25 @@ def _by_objective(
         for case in (ATTACK, RANDOM, BEST_RANDOM)
         if case in cases
     }
-    gain = gains[ATTACK].difference
-    attack, own = (f"{cases[case][_OBJECTIVE]:.4g}" for case in (ATTACK, OWN))
-    text = f"the objective {document['objective']['name']} is {attack}, unattacked "
-    text += f"{own}"
-    added = 0.0
-    if NO_OBJECT in cases:
-        empty = cases[NO_OBJECT][_OBJECTIVE]
-        added = cases[OWN][_OBJECTIVE] - empty
-        text += f", without objects {empty:.4g}"
-    text += f"; it falls by {gain:.3g}"
+    gain, chance = gains[ATTACK].difference, gains[RANDOM].difference
+    values = {case: figures[_OBJECTIVE] for case, figures in cases.items()}
+    # as many digits as show three of the gain
+    digits = max(0, 2 - math.floor(math.log10(abs(gain)))) if gain else 2
+    text = (
+        f"the objective {document['objective']['name']} is {values[ATTACK]:.{digits}f} "
+        f"with it and {values[OWN]:.{digits}f} unattacked, a gain of {gain:.3g}"
+    )
     text += _interval(gains[ATTACK].difference_ci95, gains[ATTACK].attacks, ".3g")
-    if added > 0 and 0 < gain <= 2 * added:
-        text += f", {gain / added:.0%} of what the unattacked objects add"
-    text += f", with {random} by {gains[RANDOM].difference:.3g} in the mean"
-    least = max(0.0, BEATS * gains[RANDOM].difference)
-    beats = gain > 0 and gain >= least
-    if BEST_RANDOM in cases:
+    if NO_OBJECT in values:
+        text += f"; without objects it is {values[NO_OBJECT]:.{digits}f}"
+        added = values[OWN] - values[NO_OBJECT]
+        if 0 < gain <= 2 * added:  # else a share says nothing
+            text += f", so that the attack removes {gain / added:.0%} of what they add"
+    text += f"; {random} gain {chance:.3g} in the mean"
+    beats = gain > 0 and gain >= BEATS * chance
+    if BEST_RANDOM in gains:
         best = gains[BEST_RANDOM].difference
-        text += f" and with the best of them by {best:.3g}"
+        text += f" and the best of them {best:.3g}"
         beats = beats and gain > best
     return beats, text
 

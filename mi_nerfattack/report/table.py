@@ -76,6 +76,55 @@ def runs_table(document: Document) -> Table:
     return Table(_TITLE, [_ENVIRONMENT, _CASE], figures, rows)
 
 
+def overview_table(runs: Sequence[RunPart]) -> Table:
+    """Return what each run attacked and what came of it: a row for each run."""
+    figures = [
+        *(Column("policy", "policy"), Column("vehicle", "scenario.vehicle.kind")),
+        *(Column("route", "route"), Column("objects", "objects")),
+        Column("attack", "scenario.attack.method.kind"),
+        Column("attack (m)", "surrogate.attack.cross_track_mean_m"),
+        Column("times random", lambda row: _times_random(row["surrogate"]), 1),
+        *(_out(where) for where in ("surrogate", "deployments")),
+    ]
+    caption = (
+        "What was attacked, and in the surrogate the mean distance from the lane "
+        "centre and its multiple of that with random textures; attacked drives that "
+        "leave the lane, in the surrogate and in all other environments."
+    )
+    rows = [_overview(run) for run in runs]
+    return Table("Runs", [Column("run", "run")], figures, rows, caption=caption)
+
+
+def _overview(run: RunPart) -> dict[str, Any]:
+    scenario, routes = run.document["scenario"], run.document["routes"]
+    environments = [cases for route in routes.values() for cases in route.items()]
+    sums = [sha for key, sha in run.digests.items() if key.startswith("policy.")]
+    policy = [Path(str(scenario.get("policy", {}).get("file") or "")).name]
+    others = [cases for name, cases in environments if name != "surrogate"]
+    attacked = [cases["attack"] for cases in others if "attack" in cases]
+    return {
+        "run": run.label,
+        "scenario": scenario,
+        "policy": " ".join([*policy, *(f"({sha[:8]})" for sha in sums)]) or None,
+        "route": ", ".join(routes),
+        "objects": ", ".join(item["id"] for item in scenario.get("objects", ())),
+        "surrogate": dict(environments).get("surrogate", {}),
+        "deployments": {
+            "attack": {
+                key: sum(figures[key] for figures in attacked)
+                for key in ("drives_departed", "n")
+            }
+            if attacked
+            else None
+        },
+    }
+
+
+def _out(where: str) -> Column:
+    keys = f"{where}.attack.drives_departed", f"{where}.attack.n", ""
+    return Column(f"out, {where}", keys, bad=True)
+
+
 def headline_table(runs: Sequence[RunPart]) -> Table:
     """Return runs beside each other: a row for each route and environment."""
     figures = [

@@ -143,13 +143,9 @@ def test_an_objective_is_judged_by_what_it_falls(judged, figures, beats):
 def test_the_sentence_on_an_objective_has_its_numbers(judged):
     """From -150 to -180, as without objects: all that they add."""
     sentence = objective_of(judged, np.array([-178, -179, -180, -181, -182]))
-    words = ["keeps_going is -180, unattacked -150, without objects -180", "by 30 "]
-    words += [
-        "over 5 starts: 30 to 30)",
-        "100% of what",
-        "by 5 in",
-        "best of them by 28",
-    ]
+    words = ["keeps_going is -180.0 with it and -150.0 unattacked", "gain of 30 "]
+    words += ["over 5 starts: 30 to 30); without objects it is -180.0", "removes 100%"]
+    words += ["random textures gain 5 in the mean and the best of them 28."]
     assert all(word in sentence for word in words), sentence
 
 
