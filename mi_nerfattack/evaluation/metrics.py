@@ -53,7 +53,7 @@ def summarise(
     - `n`: number of runs;
     - means are over the runs, each of which counts once, whatever its length;
     - `cross_track_mean_ci95_m`: of `random`, where each run has its own texture; null
-      for a single run, and for cases with one texture, however many starts they are
+      for fewer than five, and for cases with one texture, however many starts they are
       driven from, because starts say nothing about other attacks;
     - `per_run`: the figures of each run, ordered by its index;
     - `objective`, with `costs`: of each run, and the mean; None where one is missing.

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 RESAMPLES = 9999
-#: Fewer independent values have no interval.
+#: Fewer values, each independent, have no interval.
 FEWEST = 5
 #: Up to so many have a t interval, more a bootstrap: docs/report.md#intervals has the
 #: coverage of both.
@@ -155,15 +155,15 @@ def summary(
 
     - `attacks`, `drives`: how many;
     - `cross_track_mean_m`, `cross_track_sd_m`, `cross_track_mean_ci95_m`: mean error
-      of the attacks, its standard deviation (NaN for one attack) and its BCa interval
-      (None for one attack);
+      of the attacks, its standard deviation (NaN for one attack) and its interval
+      (None for few attacks);
     - `cross_track_mean_worst_run_m`, `cross_track_max_m`: largest mean error of a
       drive, largest error of a step;
     - `wheel_out_s`, `centre_out_s`, `cross_track_total`, `frames`, `objective`: means;
     - `attacks_out`, `attacks_out_rate_ci95`: attacks whose drives have a wheel out for
       `DEPARTED_S` in the mean, and Wilson's interval of their share;
     - `steps_departed`: sum; `drives_departed`, `departure_rate_ci95`: drives that
-      leave the lane, and Wilson's interval of their share.
+      leave the lane, and Wilson's interval of their share (None for few attacks).
 
     Args:
         table: with `cross_track_mean_m`, `wheel_out_s` and `departed`; figures of
@@ -209,7 +209,10 @@ def _figures(
         "attacks_out": out,
         "attacks_out_rate_ci95": share_interval(out, count),
         "drives_departed": left,
-        "departure_rate_ci95": share_interval(left, drives),
+        # drives of few attacks are not independent, however many there are
+        "departure_rate_ci95": share_interval(left, drives)
+        if count >= FEWEST
+        else None,
     }
     found |= {name: float(means(name).mean()) for name in _MEANS if name in columns}
     if _LARGEST in columns:

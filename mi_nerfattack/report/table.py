@@ -49,9 +49,9 @@ def metrics_table(document: Document) -> Table:
         Column("departed", "drives_departed", short="drives\nout", bad=True),
     ]
     caption = (
-        "Mean and maximum over all steps and runs. The interval of random looks is a "
-        "bootstrap over them; cases of one look have none, since their runs differ in "
-        "the start alone. Times are means over the runs; departed runs had a wheel out."
+        "Mean and maximum over all steps and runs. The interval is over random looks, "
+        "of five or more; cases of one look have none, since their runs differ in the "
+        "start alone. Times are means over the runs; departed runs had a wheel out."
     )
     if (objective := document.get("objective")) is not None:
         caption += (
@@ -270,7 +270,7 @@ def sweep_table(document: Document) -> Table:
     caption = (
         f"{document['complete']} of {document['cells']} attacks are done. Mean "
         "distance from the lane centre, over attacks, each of which counts once, with "
-        "standard deviation and 95 % interval (BCa bootstrap); drives with a wheel "
+        "standard deviation and, of five or more, 95 % interval; drives with a wheel "
         f"out, and attacks with one out for {document['departed_s']:g} s in the mean "
         "over their drives, with Wilson's intervals."
     )

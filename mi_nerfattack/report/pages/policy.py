@@ -61,11 +61,11 @@ _ROUNDS = (
     ),
 )
 _ERRORS = (
-    "Distance from the lane centre: mean over all steps of all drives, with a "
-    "bootstrap interval over drives, and the largest of any step. A drive has departed "
-    "when its distance exceeds half the lane less half the car ({}); the share of such "
-    "drives has a Wilson interval. The expert knows its position and drives from the "
-    "same starts."
+    "Distance from the lane centre: mean over all steps of all drives, with a 95 % "
+    "interval over drives, and the largest of any step. A drive has departed when its "
+    "distance exceeds half the lane less half the car ({}); the share of such drives "
+    "has a Wilson interval. Fewer than five drives have no intervals. The expert "
+    "knows its position and drives from the same starts."
 )
 _NOT_MEASURED = (
     "Times of day driven in: {}; exposures: {}. Nothing is known of all others, of "
