@@ -7,6 +7,7 @@ A run has ``metrics.json``, a sweep ``summary.json``, a transfer a whole
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -86,6 +87,10 @@ def overview_table(runs: Sequence[RunPart]) -> Table:
         Column("times random", lambda row: _times_random(row["surrogate"]), 1),
         *(_out(where) for where in ("surrogate", "deployments")),
     ]
+    if any(run.document.get("objective") for run in runs):
+        for case, name in (("own", "unattacked"), ("attack", "attacked")):
+            value = partial(_objective_of, case)
+            figures.append(Column(f"objective, {name}", value))
     caption = (
         "What was attacked, and in the surrogate the mean distance from the lane "
         "centre and its multiple of that with random textures; attacked drives that "
@@ -105,6 +110,7 @@ def _overview(run: RunPart) -> dict[str, Any]:
     return {
         "run": run.label,
         "scenario": scenario,
+        "has_objective": run.document.get("objective") is not None,
         "policy": " ".join([*policy, *(f"({sha[:8]})" for sha in sums)]) or None,
         "route": ", ".join(routes),
         "objects": ", ".join(item["id"] for item in scenario.get("objects", ())),
@@ -118,6 +124,12 @@ def _overview(run: RunPart) -> dict[str, Any]:
             else None
         },
     }
+
+
+def _objective_of(case: str, row: Document) -> Cell:
+    """Return a case's objective in the surrogate; a dash of the default objective."""
+    known = row["has_objective"] and case in row["surrogate"]
+    return _significant(row["surrogate"][case]["objective"] if known else None)
 
 
 def _out(where: str) -> Column:

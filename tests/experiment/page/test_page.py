@@ -139,6 +139,25 @@ def test_other_policies_and_vehicles_have_plots_of_their_own(tmp_path, page_of):
     assert lines[:2] == [["other", "another.pt2", "–"], ["bicycle", "–", "bicycle"]]
 
 
+def test_objectives_stand_in_the_line_of_a_run(tmp_path, page_of):
+    for name in ("one", "other"):
+        make_run(tmp_path / name, pictures=False)
+    path = tmp_path / "other" / "metrics.json"
+    document = files.read_json(path)
+    document["objective"] = {"name": "rail.py:slow", "missing": {"deployment": "why"}}
+    for environment, cases in document["routes"]["straight"].items():
+        for number, figures in enumerate(cases.values()):
+            value = -1.5 * number if environment == "surrogate" else None
+            figures["objective"] = value
+            for run in figures["per_run"]:
+                run["objective"] = value
+    files.write_json(path, document)
+    _, reader = page_of("one", "other")
+    lines = [next(row for row in reader.rows if row[0] == k) for k in ("one", "other")]
+    assert [line[-2:] for line in lines] == [["–", "–"], ["-1.5", "-4.5"]]
+    assert "It has no value in deployment: why." in reader.text
+
+
 def test_files_of_a_scenario_count_by_their_checksums():
     def run(label, digest, file):
         scenario = {"policy": {"file": file}, "name": label}
