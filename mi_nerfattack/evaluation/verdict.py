@@ -138,8 +138,10 @@ def _attack(
         lead = "beats" if beats else "does not beat"
         yield f"The attack {lead} {random} in the surrogate: {text}."
     else:
-        lead = "transfers" if beats else "does not transfer"
-        yield f"It {lead} to {name}: {text}."
+        lead = f"It transfers to {name}"
+        if not beats:
+            lead = f"It does not transfer to {name}, where it does not beat {random}"
+        yield f"{lead}: {text}."
 
 
 def _by_error(

@@ -45,7 +45,10 @@ def metrics_table(document: Document) -> Table:
         mean,
         Column("95 % (m)", "cross_track_mean_ci95_m", terminal=False),
         largest,
-        Column("wheel out (s)", "wheel_out_s", 2, short="wheel\nout (s)"),
+        Column(
+            *("wheel out (s)", "wheel_out_s", 2, "wheel\nout (s)"),
+            terminal=document.get("objective") is None,  # 80 characters have no room
+        ),
         Column("centre out (s)", "centre_out_s", 2, terminal=False),
         Column("departed", "drives_departed", short="drives\nout", bad=True),
     ]
@@ -338,7 +341,13 @@ def _objective(document: Document) -> list[Column]:
     """Return the objective's column, unless it is the distance from the lane centre."""
     if document.get("objective") is None:
         return []
-    return [Column("objective", lambda row: _significant(row["objective"]))]
+    return [
+        Column(
+            "objective",
+            lambda row: _significant(row["objective"]),
+            short="objec-\ntive",
+        )
+    ]
 
 
 def _significant(value: float | None) -> Cell:
