@@ -15,6 +15,7 @@ from mi_nerfattack import variant
 variant.ensure()  # before what imports mitsuba
 
 import diagrams  # noqa: E402
+import flat_objects  # noqa: E402
 import gallery_blocks  # noqa: E402
 import plugin_scenes  # noqa: E402
 import run_pictures  # noqa: E402
@@ -23,6 +24,7 @@ import run_pictures  # noqa: E402
 PICTURES: dict[str, Callable[[Path, bool], None]] = {
     "loop": diagrams.draw_loop,
     "chart": diagrams.draw_chart,
+    "flat": flat_objects.draw_flat,
     "gallery": gallery_blocks.gallery,
     "glass": plugin_scenes.glass,
     "plugins": plugin_scenes.plugins,

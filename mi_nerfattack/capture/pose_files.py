@@ -23,7 +23,7 @@ from mi_nerfattack.capture.intrinsics import read_cameras
 from mi_nerfattack.capture.transforms import read_frames, read_table
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
-from mi_nerfattack.io.positions import require_near
+from mi_nerfattack.io.strict import require_near
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix
 
 SUFFIXES = (".csv", ".toml", ".json")

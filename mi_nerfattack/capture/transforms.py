@@ -24,7 +24,7 @@ from mi_nerfattack.capture.posed_images import (
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.splats import read_points
 from mi_nerfattack.io import files
-from mi_nerfattack.io.positions import require_near
+from mi_nerfattack.io.strict import require_near
 from mi_nerfattack.render.camera.conventions import opencv_to_opengl, opengl_to_opencv
 from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.render.camera.pose import nearest_rigid

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
-from mi_nerfattack.commands.asset import AssetCube, AssetFolder, AssetMesh
+from mi_nerfattack.commands.asset import AssetCube, AssetFlat, AssetFolder, AssetMesh
 from mi_nerfattack.commands.attack import Attack
 from mi_nerfattack.commands.bake import Bake
 from mi_nerfattack.commands.calibrate import Calibrate
@@ -104,8 +104,13 @@ _CAPTURE = Group(
     },
 )
 _ASSET = Group(
-    "Fit a field to an object, whose texture can then be attacked.",
-    {"mesh": AssetMesh, "cube": AssetCube, "folder": AssetFolder},
+    "Make the field of an object, whose texture can then be attacked.",
+    {
+        "mesh": AssetMesh,
+        "cube": AssetCube,
+        "flat": AssetFlat,
+        "folder": AssetFolder,
+    },
 )
 _EXPORT = Group(
     "Write objects, routes and scenarios for other programs, paper and screens.",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 import tyro
 
+from mi_nerfattack.commands.shared.options import check_suffix
 from mi_nerfattack.commands.shared.progress import StageBars
 from mi_nerfattack.commands.shared.terminal import Result
 
@@ -226,3 +227,50 @@ class AssetFolder(_Asset):
         return read_views(
             self.source, placement, self.bounds, self.long_edge, self.skip_missing
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AssetFlat:
+    """Write a billboard, which stands, or a patch, which lies: one flat picture.
+
+    A scenario needs no file of it: see `kind` of [[objects]]. A file serves commands
+    that draw places, as train, evaluate and sweep do.
+    """
+
+    kind: tyro.conf.Positional[Literal["billboard", "patch"]]
+    output: Path
+    """Field file to write (.safetensors)."""
+    width_m: float
+    """Width of the picture."""
+    height_m: float
+    """Height of the picture; of a patch, its length along the lane."""
+    picture: Path | None = None
+    """Image that is stretched over it; grey by default."""
+    pixels_per_m: float = 32.0
+    """Resolution along the longer edge."""
+    json: bool = False
+    """End with one line of JSON instead of a sentence."""
+
+    def run(self) -> Result:
+        """Read the picture and write the field."""
+        from mi_nerfattack import variant
+        from mi_nerfattack.capture.mesh.flat import FlatObject
+        from mi_nerfattack.fields.io import save_field
+        from mi_nerfattack.io import files
+
+        check_suffix(self.output, ".safetensors")
+        files.check_writable(self.output)
+        flat = FlatObject(
+            self.kind, self.width_m, self.height_m, pixels_per_m=self.pixels_per_m
+        )
+        variant.ensure()
+        picture = None
+        if self.picture is not None:
+            picture = files.read_image(self.picture)[..., :3]
+        save_field(self.output, flat.field(picture))
+        told = (
+            f"Wrote {self.output}: {self.kind} of {self.width_m:g} x {self.height_m:g} "
+            f"m, {flat.pixels} pixels along each edge"
+        )
+        figures = {"kind": self.kind, "pixels": flat.pixels}
+        return Result({"output": str(self.output), **figures}, lambda: print(told))

@@ -106,7 +106,10 @@ class ExportFaces:
 
 @dataclass(frozen=True)
 class ExportPrint:
-    """Write the attacked box of a run as a net on paper, to cut, fold and glue."""
+    """Write the attacked box of a run as a net on paper, to cut, fold and glue.
+
+    A billboard or patch is one sheet, without tabs.
+    """
 
     run_folder: tyro.conf.Positional[Path]
     output: Path
@@ -142,7 +145,8 @@ class ExportPrint:
             count = write_net(path, box, edges, self.paper, self.dpi, counter)
         size = " x ".join(f"{edge:.1f}" for edge in edges)
         pages = "page" if count == 1 else "pages"
-        told = f"Wrote {path}: net of {box.name}, {size} mm, {count} {pages}"
+        what = "net" if box.sheet is None else "sheet"
+        told = f"Wrote {path}: {what} of {box.name}, {size} mm, {count} {pages}"
         figures = {"edges_mm": edges.tolist(), "pages": count}
         document = {"output": str(path), "box": box.name, **figures}
         return Result(document, lambda: print(told))
@@ -173,7 +177,7 @@ class ExportScreen(ScreenOptions):
         box, views = read_box(self.run_folder, self.box)
         face = self.face or seen_most(box, views)
         edges = box.edges_mm(self.size_mm)
-        spot = Net(edges).faces[face]
+        spot = Net(edges, box.sheet).faces[face]
         size, longest = (spot.width, spot.height), float(edges.max())
         image = screen_image(screen, box.images[face], size, self.background, longest)
         if path.suffix.lower() == ".png":

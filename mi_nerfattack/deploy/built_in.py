@@ -11,6 +11,7 @@ import numpy as np
 
 from mi_nerfattack.backend.colour import linear_to_uint8
 from mi_nerfattack.capture.mesh.atlas import Atlas, lay_out
+from mi_nerfattack.capture.mesh.cube_faces import sheet_mesh
 from mi_nerfattack.capture.mesh.mesh import MeshPart, TexturedMesh, mitsuba_shapes
 from mi_nerfattack.capture.mesh.surface import (
     check_same_box,
@@ -102,7 +103,8 @@ def make_built_in(
         field: the object, as attacked.
         pose: object to world.
         mesh: the object's own geometry (glTF, OBJ, PLY), which the field was fitted
-            to; None for the surface of the field, as `export` extracts it.
+            to; None for the surface of the field, as `export` extracts it, or the face
+            of a flat object.
         placement: size and axes of the mesh that were given to `asset`.
         captured_irradiance: E, in the field's unit of radiance times steradian; pi,
             the default, takes radiance as albedo.
@@ -118,11 +120,14 @@ def make_built_in(
         )
     texel = 0.5 * voxel_m(field) if texel_m is None else texel_m
     if mesh is None:
+        solid = sheet_mesh(field)
+    else:
+        solid = (placement or Placement()).mesh(mesh)
+    if solid is None:
         corners, normals = _field_triangles(field)
     else:
-        placed = (placement or Placement()).mesh(mesh)
-        check_same_box(field, placed)
-        corners = _outward(field, _solid_corners(placed))
+        check_same_box(field, solid)
+        corners = _outward(field, _solid_corners(solid))
         normals = _flat_normals(corners)
     atlas = lay_out(corners, texel)
     radiance = _texel_colours(field, atlas, corners, normals)
@@ -133,7 +138,7 @@ def make_built_in(
         atlas.uv.reshape(-1, 2),
         atlas.image(albedo),
         pose,
-        normals.reshape(-1, 3) if mesh is None else None,
+        normals.reshape(-1, 3) if solid is None else None,
     )
 
 

@@ -17,7 +17,7 @@ from mi_nerfattack.fields.levels import count_read
 from mi_nerfattack.fields.ngp import NGPField, NGPLayout
 from mi_nerfattack.fields.occupancy import Occupancy
 from mi_nerfattack.io import files
-from mi_nerfattack.io.positions import require_near
+from mi_nerfattack.io.strict import require_near
 
 T = TypeVar("T", int, float)
 

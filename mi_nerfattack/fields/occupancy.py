@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.backend.arrays import upload
+from mi_nerfattack.errors import InputError
 
 MAX_DISTANCE = 255
 
@@ -64,6 +65,19 @@ class Occupancy:
     def fraction(self) -> float:
         """Share of the cells that are occupied, 0 to 1."""
         return float(self.cells.mean())
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """Smallest and largest corner of what is occupied, (2, 3), in the unit box.
+
+        Raises:
+            InputError: no cell is occupied.
+        """
+        if not self.cells.any():
+            raise InputError("field: no cell is occupied; make the field again")
+        sides = [self.cells.any(axis) for axis in ((1, 2), (0, 2), (0, 1))]
+        found = [np.flatnonzero(side)[[0, -1]] + [0, 1] for side in sides]
+        return np.transpose(found) / self.shape
 
     def query(self, unit: mi.Point3f, active: mi.Bool) -> tuple[mi.Float, mi.Point3f]:
         """Look up the distance grid.

@@ -18,7 +18,7 @@ import numpy as np
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
-from mi_nerfattack.io.positions import require_near
+from mi_nerfattack.io.strict import require_near
 
 MAX_BYTES = 1 << 31
 MAX_HEADER_BYTES = 1 << 16

@@ -10,6 +10,8 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from mi_nerfattack.capture.mesh.cube_faces import (
+    FLAT,
+    FLAT_FACES,
     CubeFaces,
     flat_share,
     object_box,
@@ -54,6 +56,7 @@ class AttackedBox:
         lower, upper: (3,), of the box in its own frame, metres.
         pose: own frame to world, attacked.
         images: by the names of `FACES`: (h, w, 3), uint8 sRGB, as seen from outside.
+        sheet: name of the face that a flat object is; None for a whole box.
     """
 
     name: str
@@ -63,6 +66,7 @@ class AttackedBox:
     upper: np.ndarray
     pose: Pose
     images: Mapping[str, np.ndarray]
+    sheet: str | None = None
 
     @property
     def edges_m(self) -> np.ndarray:
@@ -143,14 +147,17 @@ def read_box(
     if name is not None and name not in names:
         raise InputError(f"--box: {name!r}; {run} has {', '.join(names)}")
     fields = {n: load_grid(object_path(run, n)) for n in ([name] if name else names)}
-    shares = {n: flat_share(field) for n, field in fields.items()}
+    shares = {
+        n: 1.0 if FLAT in field.info else flat_share(field)
+        for n, field in fields.items()
+    }
     boxes = [n for n, share in shares.items() if share >= _FLAT]
     if not boxes:
         told = ", ".join(f"{n} to {100 * share:.0f} %" for n, share in shares.items())
         raise InputError(
             f"{run}: no box was attacked: its sides are surface, of {told}; only boxes "
             "can be folded, shown and projected: attack one of 'mi-nerfattack asset "
-            "cube', or bundled:cube/field.safetensors"
+            "cube', bundled:cube/field.safetensors, or a billboard or patch"
         )
     if len(boxes) > 1:
         raise InputError(f"--box: is missing; {run} has {', '.join(boxes)}")
@@ -158,18 +165,33 @@ def read_box(
     number, field = names.index(boxes[0]), fields[boxes[0]]
     moved = poses[number].moved(found.offsets[number])
     lower, upper, images = box_pictures(field, texture_px)
-    label, digest = found.label, found.digest
-    return AttackedBox(boxes[0], label, digest, lower, upper, moved, images), views
+    sheet = None
+    if FLAT in field.info:
+        (sheet,) = (k for k, v in FACES.items() if v == FLAT_FACES[field.info[FLAT]])
+    box = AttackedBox(
+        name=boxes[0],
+        run=found.label,
+        digest=found.digest,
+        lower=lower,
+        upper=upper,
+        pose=moved,
+        images=images,
+        sheet=sheet,
+    )
+    return box, views
 
 
 def seen_most(box: AttackedBox, views: Views) -> str:
     """Return the face that filled most of the image over all views.
 
-    By the solid angle of what lies within the image; nothing hides anything.
+    By the solid angle of what lies within the image; nothing hides anything. Of a
+    flat object, it is its sheet.
 
     Raises:
         InputError: there are no views, or no face is in any.
     """
+    if box.sheet is not None:
+        return box.sheet
     share = (np.arange(_POINTS) + 0.5) / _POINTS
     angles = {face: 0.0 for face in FACES}
     matrices = views.camera_to_world

@@ -1,4 +1,7 @@
-"""The net of a box: its faces as a cross, glue tabs, and what to cut and to fold."""
+"""The net of a box: its faces as a cross, glue tabs, and what to cut and to fold.
+
+The net of a flat object is one face.
+"""
 
 from __future__ import annotations
 
@@ -70,6 +73,7 @@ class Net:
 
     Args:
         edges_mm: (3,), of the box along its own x, y and z.
+        sheet: name of the only face, of a flat object; None for all faces.
 
     Attributes:
         faces: by their names.
@@ -78,7 +82,7 @@ class Net:
         folds: lines between faces, and between faces and tabs.
     """
 
-    def __init__(self, edges_mm: np.ndarray) -> None:
+    def __init__(self, edges_mm: np.ndarray, sheet: str | None = None) -> None:
         x, y, z = map(float, edges_mm)
         self.faces = {
             "left": Rectangle(0, 0, y, z),
@@ -88,6 +92,20 @@ class Net:
             "top": Rectangle(y, z, x, y),
             "bottom": Rectangle(y, -y, x, y),
         }
+        self.tabs: list[Tab] = []
+        self.folds: list[Line] = []
+        self.cuts: list[Line] = []
+        if sheet is None:
+            self._add_lines(x, y, z)
+        else:
+            face = self.faces[sheet]
+            self.faces = {sheet: face}
+            xs, ys = (face.left, face.right), (face.bottom, face.top)
+            self.cuts += [((a, ys[0]), (a, ys[1])) for a in xs]
+            self.cuts += [((xs[0], b), (xs[1], b)) for b in ys]
+
+    def _add_lines(self, x: float, y: float, z: float) -> None:
+        """Add tabs, and where to cut and to fold."""
         depth = min(_TAB_MM, _TAB_SHARE * min(x, y, z))
         ends = (0.0, y, y + x, 2 * y + x, 2 * (x + y))
         left, front, right, after, end = ends
@@ -104,8 +122,8 @@ class Net:
         self.tabs = [Tab(_tab(p, q, depth), under) for p, q, under in folds]
         inner: list[Line] = [((e, 0.0), (e, z)) for e in ends[1:4]]
         inner += [((front, level), (right, level)) for level in (0.0, z)]
-        self.folds: list[Line] = inner + [(p, q) for p, q, _ in folds]
-        self.cuts: list[Line] = [((end, 0.0), (end, z))]
+        self.folds = inner + [(p, q) for p, q, _ in folds]
+        self.cuts = [((end, 0.0), (end, z))]
         for low, high, outer in ((z, z + y, z + y), (-y, 0.0, -y)):
             self.cuts.append(((front, outer), (right, outer)))
             self.cuts += [((side, low), (side, high)) for side in (front, right)]

@@ -138,7 +138,7 @@ def write_net(
     """
     if not 10 <= dpi <= _MAX_DPI:
         raise InputError(f"--dpi: {dpi}; allowed are 10 to {_MAX_DPI}")
-    net = Net(edges_mm)
+    net = Net(edges_mm, box.sheet)
     sheets = lay_out(net, paper)
     total = len(sheets.tiles) + (len(sheets.tiles) > 1)
     about = {"Title": f"{box.name}, run {box.run}", "CreationDate": None}

@@ -41,8 +41,8 @@ from mi_nerfattack.rollout.adjoint import (
 )
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.scenario.named_file import File
+from mi_nerfattack.scenario.objective import VarySection
 from mi_nerfattack.scenario.section import Kinds, Section, refuse
-from mi_nerfattack.scenario.vary import VarySection
 
 Population = Annotated[int, Field(ge=2)]
 

@@ -34,6 +34,7 @@ from mi_nerfattack.scenario.deployment import (
 )
 from mi_nerfattack.scenario.named_file import File, NamedFile, portable_text
 from mi_nerfattack.scenario.objective import ObjectiveSection
+from mi_nerfattack.scenario.objects import FieldObjectSection, ObjectSection, Triple
 from mi_nerfattack.scenario.policy import (
     PilotNetSection,
     PolicySection,
@@ -56,7 +57,6 @@ STEERED = ("ackermann", "ackermann_rate", "bicycle")
 _MAX_CHARACTERS = 1 << 16
 _LAYER = re.compile(r"scene\d*|background|cost|input")  # of frames, beside objects'
 
-Triple = tuple[Finite, Finite, Finite]
 Row = tuple[Finite, Finite, Finite, Finite]
 
 #: Of `[scene]`, what only drives in the surrogate depend on.
@@ -108,23 +108,6 @@ class SceneSection(Section):
             if getattr(self, key) != self.defaults()[key]:
                 refuse(key, f"{self.surrogate} says it; leave out this, or surrogate")
         return self
-
-
-class ObjectSection(Section):
-    """An object whose texture is attacked."""
-
-    id: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
-    field: File | None = None  # grid field file; not with scene.surrogate
-    position_m: Triple | None = None  # likewise
-    yaw_deg: Finite = 0.0
-    scale: Positive = 1.0
-    step_m: Positive | None = None  # of the march, before `scale`; the field's own
-
-    @property
-    def pose(self) -> Pose:
-        """Where it stands."""
-        assert self.position_m is not None  # checked by Scenario
-        return Pose.upright(self.position_m, np.radians(self.yaw_deg), self.scale)
 
 
 class DriveSection(Section):
@@ -280,7 +263,7 @@ class Scenario(Section):
     def _check_placed(self) -> None:
         for index, item in enumerate(self.objects):
             for key in ("field", "position_m"):
-                if getattr(item, key) is None:
+                if getattr(item, key, "") is None:
                     refuse(f"objects.{index}.{key}", "is missing")
 
     def _check_named(self, xml: NamedFile) -> None:
@@ -288,7 +271,10 @@ class Scenario(Section):
         lens = ("width", "height", "fov_x_deg", *CameraSection.lens)
         groups = [("camera", self.camera, lens), ("attack", self.attack, ("jitter",))]
         own = ("field", "position_m", "yaw_deg", "scale", "step_m")
-        groups += [(f"objects.{i}", item, own) for i, item in enumerate(self.objects)]
+        for index, item in enumerate(self.objects):
+            if not isinstance(item, FieldObjectSection):
+                refuse(f"objects.{index}.kind", f"{xml} says it; leave it out")
+            groups.append((f"objects.{index}", item, own))
         for where, section, keys in groups:
             for key in keys:
                 if getattr(section, key) != section.defaults()[key]:
@@ -390,6 +376,11 @@ def load_scenario(
     if object_field is None:
         return scenario, text
     field = NamedFile(str(object_field.resolve()), object_field.resolve())
-    objects = [o.model_copy(update={"field": field}) for o in scenario.objects]
+    objects = [
+        o.model_copy(update={"field": field})
+        if isinstance(o, FieldObjectSection)
+        else o
+        for o in scenario.objects
+    ]
     scenario = scenario.model_copy(update={"objects": tuple(objects)})
     return scenario, portable_text(scenario, text)

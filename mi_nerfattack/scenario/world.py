@@ -19,7 +19,7 @@ from mi_nerfattack.deploy.surrogate.environment import SurrogateEnvironment
 from mi_nerfattack.deploy.surrogate.scene import field_sensor, scene_sensor, showing
 from mi_nerfattack.deploy.vehicle import Motion
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields import GridField, load_field, load_grid
+from mi_nerfattack.fields import GridField, load_field
 from mi_nerfattack.fields.compact_splats import load_splats
 from mi_nerfattack.fields.io import holds_splats
 from mi_nerfattack.io.resumable import array_digest
@@ -35,8 +35,8 @@ from mi_nerfattack.rollout.objective import AbstractObjective
 from mi_nerfattack.rollout.scene_sensor import SceneSensor
 from mi_nerfattack.rollout.sensor import AbstractSensor
 from mi_nerfattack.scenario.deployment import SURROGATE, Deployment, deployments
+from mi_nerfattack.scenario.objective import VarySection
 from mi_nerfattack.scenario.scenario import SMOOTH_SPP, Scenario, SceneSection
-from mi_nerfattack.scenario.vary import VarySection
 from mi_nerfattack.vehicle.route.route import Route
 
 
@@ -282,10 +282,7 @@ def build_surrogate(scenario: Scenario) -> SceneSensor:
         return sensor
     posed = []
     for item in scenario.objects:
-        assert item.field is not None  # checked by Scenario
-        field = load_grid(item.field.file)
-        field.refine(item.step_m or field.step_m)
-        posed.append(PosedField(field, item.pose))
+        posed.append(PosedField(item.load(), item.pose))
     jitter = scenario.seed if scenario.attack.jitter else None
     look = jitter, place.stop, place.composite, names
     assert place.field is not None  # checked by SceneSection

@@ -21,7 +21,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.io import load_field, save_field
 from mi_nerfattack.fields.splats import read_splats
 from mi_nerfattack.io import files
-from mi_nerfattack.io.positions import FAR_M, require_near
+from mi_nerfattack.io.strict import FAR_M, require_near
 from mi_nerfattack.render.camera.intrinsics import CameraMount
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.vehicle.route.route import load_routes

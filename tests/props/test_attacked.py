@@ -20,6 +20,7 @@ from support.worlds.views import write_transforms
 
 from mi_nerfattack import cli
 from mi_nerfattack.capture.mesh.cube_faces import flat_share
+from mi_nerfattack.capture.mesh.flat import FlatObject
 from mi_nerfattack.drives.store import read_drives
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.transfer.found import read_found
@@ -58,6 +59,13 @@ def test_box_of_a_run(run):
     assert front.shape == (24, 24, 3) and front.min() > 5
     assert (front[:, -4, 0] - front[:, 3, 0]).mean() > 30
     assert (front[3, :, 2] - front[-4, :, 2]).mean() > 30
+
+
+def test_a_billboard_of_a_run_is_its_front(tmp_path):
+    run = boxes.attacked_run(tmp_path, FlatObject("billboard", 16.0, 8.0, 2).field())
+    box, views = read_box(run, texture_px=24)
+    assert box.sheet == "front" == seen_most(box, views)
+    assert box.images["front"].shape == (12, 24, 3)
 
 
 def test_the_face_that_is_seen_most():

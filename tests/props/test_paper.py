@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import zlib
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -110,6 +111,20 @@ def test_one_page_is_exact(tmp_path):
     at = pixels.shape[0] - round(15.5 * 150 / 25.4)
     columns = np.nonzero(pixels[at] < 100)[0] * 25.4 / 150
     assert np.ptp(columns) == pytest.approx(100, abs=0.5)
+
+
+@pytest.mark.parametrize(("sheet", "size"), [("front", (40, 20)), ("top", (40, 30))])
+def test_a_flat_object_is_one_sheet(tmp_path, sheet, size):
+    box = replace(made_box(extent=(1.0, 0.75, 0.5)), sheet=sheet)
+    edges = box.edges_mm(40.0)
+    net = Net(edges, sheet)
+    assert not net.tabs and not net.folds and len(net.cuts) == 4
+    assert (net.bounds.width, net.bounds.height) == pytest.approx(size)
+    assert paper.write_net(tmp_path / "a.pdf", box, edges) == 1
+    ((_, pictures),) = pdf_pages(tmp_path / "a.pdf")
+    assert [(p.width, p.height) for p in pictures] == [pytest.approx(size, abs=0.01)]
+    (figure,) = paper.pages(box, net, paper.lay_out(net, "a4"), edges, 150)
+    np.testing.assert_allclose(coloured(figure, COLOURS[sheet]), size, atol=0.5)
 
 
 @pytest.mark.parametrize("name", paper.PAPERS)

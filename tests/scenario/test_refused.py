@@ -37,6 +37,12 @@ route = "lane" -> => :2: scene.route: is missing
 [[objects]]; id = "hydrant"; field = "a"; position_m = [0, 0, 0] => hydrant.*differ
 [[objects]]; id = "scene1"; field = "a"; position_m = [0, 0, 0] => scene1.*layers
 [[objects]]; id = "background"; field = "a"; position_m = [0, 0, 0] => background.*lay
+[[objects]]; kind = "wall"; id = "b" => objects.1.kind: is 'wall'; one of .*billboard
+[[objects]]; kind = "patch"; id = "b"; width_m = 1 => objects.1.height_m: is missing
+[[objects]]; kind = "patch"; id = "b"; width_m = 1; height_m = 2 => 1.position_m: is mi
+[[objects]]; kind = "patch"; id = "b"; scale = 2 => objects.1.scale: .*"patch"
+[[objects]]; kind = "billboard"; id = "b"; width_m = 1; height_m = 9; pixels_per_m = 99
+  => :16: objects.1.pixels_per_m: .*at most 256
 [attack => scenario.toml: .*valid TOML
 [attack.freedom]; lowest = 0.9; highest = 0.2 => freedom.lowest: .*0.2
 [attack.freedom]; fixed_m = [[[0, 0, 0], [0, 1, 1]]] => fixed_m: .*lower < upper

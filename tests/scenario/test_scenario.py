@@ -9,6 +9,7 @@ import pytest
 from support.files.runs import HEAD, write_named_files
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
 from mi_nerfattack.io.resumable import differences
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.render.camera.intrinsics import Camera
@@ -107,6 +108,38 @@ def test_values_and_names_of_functions_count(load, tmp_path):
     text = HEAD.replace(POLICY, CODE)
     texts = HEAD, f"{HEAD}[drive]\nhorizon = 4\n", text, text.replace(":f", ":g")
     assert len({load(each)[0].digest() for each in texts}) == 4
+
+
+def test_a_billboard_counts_with_its_picture(load, tmp_path):
+    write_named_files(tmp_path)
+    board = """[[objects]]
+kind = "billboard"
+id = "board"
+width_m = 2
+height_m = 1.5
+picture = "a.png"
+position_m = [1, 2, 0]
+yaw_deg = 90
+"""
+    files.write_image(tmp_path / "a.png", np.full((3, 4, 3), 200, np.uint8))
+    before, text = load(HEAD + board)
+    first = before.identity()
+    assert first["scenario.objects[1].kind"] == '"billboard"'
+    again = replayed(before, text, tmp_path / "other")
+    assert again.digest() == before.digest()
+    field, pose = again.objects[1].load(), again.objects[1].pose
+    np.testing.assert_allclose(field.upper - field.lower, [2, 0.02, 1.5])
+    np.testing.assert_allclose(pose.rotation[:, 0], [0, 1, 0], atol=1e-9)
+    files.write_image(tmp_path / "a.png", np.full((3, 4, 3), 100, np.uint8))
+    second = load(HEAD + board)[0].identity()
+    changed = {key for key in first if first[key] != second[key]}
+    assert changed == {"scenario.objects[1].picture"}
+
+
+def test_an_object_of_a_file_need_not_say_so(load, tmp_path):
+    write_named_files(tmp_path)
+    said = HEAD.replace("[[objects]]", '[[objects]]\nkind = "field"')
+    assert load(said)[0].digest() == load(HEAD)[0].digest()
 
 
 def test_all_problems_of_a_table_are_told_at_once(load):

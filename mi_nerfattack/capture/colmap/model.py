@@ -17,7 +17,7 @@ from mi_nerfattack.capture.colmap.process import PARTS, POINTS, RESULT
 from mi_nerfattack.capture.posed_images import PosedImages, differing, load_images
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
-from mi_nerfattack.io.positions import require_near
+from mi_nerfattack.io.strict import require_near
 from mi_nerfattack.render.camera.conventions import (
     COLMAP_MODELS,
     colmap_to_opencv,

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.backend.colour import straight_rgba
-from mi_nerfattack.capture.mesh.mesh import CUBE_FACES
+from mi_nerfattack.capture.mesh.mesh import CUBE_FACES, MeshPart, TexturedMesh
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.io import files
@@ -26,6 +26,10 @@ _RIM_PX = 3
 _FLAT_VOXELS = 5  # how far a fitted surface lies from the object's
 OBJECT_BOX = ("provenance.object_lower", "provenance.object_upper")
 """Header entries of the box of the object that a field was fitted to."""
+FLAT = "provenance.flat"
+"""Header entry of the field of a flat object: its kind."""
+FLAT_FACES = {"billboard": "ny", "patch": "pz"}
+"""Which face of the box shows the picture, as `CUBE_FACES` names it, by kind."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +69,26 @@ def object_box(field: GridField) -> tuple[np.ndarray, np.ndarray]:
             f"header entries {', '.join(OBJECT_BOX)}: {lower} to {upper}; no box"
         )
     return lower, upper
+
+
+def sheet_mesh(field: GridField) -> TexturedMesh | None:
+    """Return the face of a flat object that shows the picture; None for other fields.
+
+    Raises:
+        InputError: the field's header names no kind of flat object.
+    """
+    kind = field.info.get(FLAT)
+    if kind is None:
+        return None
+    if kind not in FLAT_FACES:
+        raise InputError(
+            f"header entry '{FLAT}' is {kind!r}; allowed: {', '.join(FLAT_FACES)}"
+        )
+    normal, right, up = np.array(CUBE_FACES[FLAT_FACES[kind]], np.float64)
+    sides = np.array([-right - up, right - up, right + up, -right + up])
+    middle, half = (field.lower + field.upper) / 2, (field.upper - field.lower) / 2
+    part = MeshPart(middle + half * (normal + sides), np.array([[0, 1, 2], [0, 2, 3]]))
+    return TexturedMesh(kind, (part,))
 
 
 def render_faces(field: GridField, pixels_per_m: float | None = None) -> CubeFaces:

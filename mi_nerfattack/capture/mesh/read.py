@@ -21,7 +21,7 @@ from mi_nerfattack.capture.mesh.mesh import MeshPart, TexturedMesh
 from mi_nerfattack.capture.mesh.texture import flat_texture, laid_out
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
-from mi_nerfattack.io.positions import require_near
+from mi_nerfattack.io.strict import require_near
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
 _FARTHEST = 1e12

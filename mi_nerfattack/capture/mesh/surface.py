@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
-from mi_nerfattack.capture.mesh.cube_faces import OBJECT_BOX, object_box
+from mi_nerfattack.capture.mesh.cube_faces import OBJECT_BOX, object_box, sheet_mesh
 from mi_nerfattack.capture.mesh.mesh import TexturedMesh
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
@@ -52,7 +52,8 @@ def field_surface(field: GridField) -> ColouredMesh:
 
     Marching cubes over the opacity of one voxel, `1 - exp(-density voxel)`, at the
     field's finest resolution, at 0.5. Pinholes are closed and hollows that nobody
-    sees filled, specks below a thousandth of the largest part left out.
+    sees filled, specks below a thousandth of the largest part left out. The
+    surface of a flat object is the face that shows its picture.
 
     Args:
         field: the object.
@@ -60,6 +61,8 @@ def field_surface(field: GridField) -> ColouredMesh:
     Raises:
         InputError: the field is nowhere opaque.
     """
+    if (sheet := sheet_mesh(field)) is not None:
+        return painted_mesh(field, sheet)
     from skimage.measure import marching_cubes
 
     voxel = voxel_m(field)

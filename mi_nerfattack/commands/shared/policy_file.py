@@ -135,7 +135,7 @@ class PolicyFile:
             field = None if scene.field is None else scene.field.file
             if field and holds_splats(field):
                 field = None
-            fields = [item.field for item in self.scenario.objects]
+            fields = [item.named for item in self.scenario.objects]
             place = replace(
                 place,
                 scene=scene.deployment.file,

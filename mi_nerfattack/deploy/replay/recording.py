@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.io.positions import require_near
+from mi_nerfattack.io.strict import require_near
 from mi_nerfattack.render.camera.intrinsics import (
     Camera,
     CameraMount,

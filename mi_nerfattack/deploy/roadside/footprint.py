@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.render.camera.pose import Pose
 
@@ -37,16 +36,14 @@ class Shape:
             InputError: nothing of it is occupied.
         """
         cells = field.occupancy.cells
-        if not cells.any():
-            raise InputError("object: no cell of its field is occupied; make it anew")
-        cell = (field.upper - field.lower) / cells.shape
+        size = field.upper - field.lower
+        lower, upper = field.lower + size * field.occupancy.bounds
+        cell = size / cells.shape
         occupied, rng = np.flatnonzero(cells), np.random.default_rng(0)
         chosen = occupied[rng.integers(len(occupied), size=_POINTS)]
         index = np.stack(np.unravel_index(chosen, cells.shape), -1)
         points = field.lower + (index + rng.uniform(size=(_POINTS, 3))) * cell
-        sides = [np.flatnonzero(cells.any(other)) for other in ((1, 2), (0, 2), (0, 1))]
-        first, last = np.array([(side[0], side[-1] + 1) for side in sides]).T
-        return Shape(field.lower + first * cell, field.lower + last * cell, points)
+        return Shape(lower, upper, points)
 
     @property
     def size(self) -> np.ndarray:

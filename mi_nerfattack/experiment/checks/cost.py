@@ -141,7 +141,7 @@ def _iteration(world: World) -> tuple[float, float, float, float]:
 
 
 def _field_bytes(world: World) -> int:
-    named = [item.field for item in world.scenario.objects]
+    named = [item.named for item in world.scenario.objects]
     return sum(item.file.stat().st_size for item in named if item is not None)
 
 

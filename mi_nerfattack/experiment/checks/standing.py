@@ -44,7 +44,7 @@ class Solid:
         name: its id.
         posed: the object.
         points: (n, 3) solid points in the world, metres, on a lattice of 32 along each
-            axis of the box; n may be 0.
+            axis of what is occupied of the box; n may be 0.
     """
 
     name: str
@@ -55,15 +55,15 @@ class Solid:
     def of(name: str, posed: PosedField) -> Solid:
         """Find the solid points of an object as it is placed."""
         field = posed.field
-        size = field.upper - field.lower
+        box = field.upper - field.lower
+        lower, upper = field.lower + box * field.occupancy.bounds
+        size = upper - lower
         index = dr.arange(mi.UInt32, _CELLS**3)
         cells = index // _CELLS**2, index // _CELLS % _CELLS, index % _CELLS
         unit = (mi.Point3f(*map(mi.Float, cells)) + 0.5) / _CELLS
-        at = mi.Point3f(*map(float, field.lower)) + unit * mi.Vector3f(
-            *map(float, size)
-        )
+        at = mi.Point3f(*map(float, lower)) + unit * mi.Vector3f(*map(float, size))
         solid = np.argwhere(_is_solid(posed, at).reshape([_CELLS] * 3))
-        local = field.lower + (solid + 0.5) / _CELLS * size
+        local = lower + (solid + 0.5) / _CELLS * size
         return Solid(name, posed, posed.placed.apply(local))
 
     def is_solid(self, points: np.ndarray) -> np.ndarray:

@@ -6,7 +6,6 @@ import json
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -276,16 +275,17 @@ def draw_above(path: Path, folders: Sequence[Path]) -> None:
         InputError: a drive is missing or damaged, or a file that a scenario names.
     """
     drives: list[Drive] = []
-    footprints, grids = [], cache(load_grid)
+    footprints, grids = [], {}
     scenario, _ = load_scenario(folders[0] / SCENARIO)
     route = driven_route(scenario, scenario.vehicle.motion())
     for folder in folders:
         own, _ = load_scenario(folder / SCENARIO)
-        footprints += object_footprints(
-            PosedField(grids(item.field.file), item.pose)
-            for item in own.objects
-            if item.field is not None  # else it is in a scene in XML
-        )
+        for item in own.objects:
+            if item.position_m is None:  # it is in a scene in XML
+                continue
+            if item not in grids:
+                grids[item] = item.load()
+            footprints += object_footprints([PosedField(grids[item], item.pose)])
         routes = read_finished(folder)["routes"].values()
         closed = {environment for cases in routes for environment in cases}
         drives += [

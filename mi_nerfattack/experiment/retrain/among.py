@@ -14,7 +14,6 @@ from mi_nerfattack.drives.spec import short_digest
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.run_folder import object_path
 from mi_nerfattack.experiment.transfer.found import FoundAttack
-from mi_nerfattack.fields import load_grid
 from mi_nerfattack.fields.io import holds_splats
 from mi_nerfattack.io.resumable import differences, flatten, refuse
 from mi_nerfattack.render.posed import PosedField
@@ -93,8 +92,7 @@ def attacked_objects(found: FoundAttack) -> list[PosedField]:
     """
     result = []
     for item, offset in zip(found.scenario.objects, found.offsets, strict=True):
-        field = load_grid(object_path(found.folder, item.id))
-        field.refine(item.step_m or field.step_m)
+        field = item.load(object_path(found.folder, item.id))
         result.append(PosedField(field, item.pose))
         result[-1].move(offset)
     return result

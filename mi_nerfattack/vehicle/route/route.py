@@ -12,7 +12,7 @@ import numpy as np
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
-from mi_nerfattack.io.positions import require_near
+from mi_nerfattack.io.strict import require_near
 from mi_nerfattack.notebook import picture
 from mi_nerfattack.ranges import Positive, Whole, checked
 from mi_nerfattack.vehicle.route.polyline import (

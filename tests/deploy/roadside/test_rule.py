@@ -245,7 +245,7 @@ def narrow() -> mi.Scene:
 
 
 test_no_room_and_rules_out_of_range_are_refused = refusals(
-    (stood(empty), "no cell of its field"),
+    (stood(empty), "no cell is occupied"),
     (stood(lambda: solid_box(9.0, 9.0, 3.0), narrow), "fewer or other sizes"),
     (stood(small_grid, walled, gap_m=(2.0, 2.5)), "'straight': .* 0 of 1.* 0.0 to 38"),
     (lambda: Roadside(scales=()), "Roadside.scales: none"),

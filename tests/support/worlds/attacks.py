@@ -171,7 +171,8 @@ def attacked_run(folder: Path, field: GridField) -> Path:
             "freedom.learning_rate = 0.5\n": "",
         },
     )
-    empty_border(field)
+    if field.window.is_open:
+        empty_border(field)
     save_field(folder / "object.safetensors", field)
     (folder / "smooth.py").write_text("from support.worlds.loops import SmoothPolicy\n")
     scenario, text = load_scenario(folder / "scenario.toml")
