@@ -97,7 +97,7 @@ def scene_of_drive(viewed: ViewedRun, drive: Drive) -> object:
     items = [make_built_in(i.field, i.placed) for i in viewed.world.surrogate.objects]
     shapes = built_in_shapes(items)
     car = solid_car()
-    for k, (x, y, theta) in enumerate(drive.states[10::12]):
+    for k, (x, y, theta) in enumerate(drive.poses[10::12]):
         moved = car.transformed(1.0, np.array([AXLE_M, 0, 0]))
         moved = moved.turned(float(np.degrees(theta)))
         moved = moved.transformed(1.0, np.array([x, y, 0]))
@@ -121,7 +121,7 @@ def solid_car() -> TexturedMesh:
 
 def path_strip(drive: Drive, width_m: float = 0.25, z_m: float = 0.03) -> MeshPart:
     """Make a flat strip along the drive, in the colour of its case."""
-    states = drive.states
+    states = drive.poses
     side = 0.5 * width_m * np.stack([-np.sin(states[:, 2]), np.cos(states[:, 2])], 1)
     edges = np.concatenate([states[:, :2] - side, states[:, :2] + side])
     k, n = np.arange(len(states) - 1), len(states)
@@ -142,7 +142,7 @@ def driven(
     path = overhead.to_px(drive.states[: step + 1, :2])
     colour = COLOURS[drive.case]
     draw.line([tuple(point) for point in path], colour, 3)
-    x, y, theta = drive.states[step]
+    x, y, theta = drive.poses[step]
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array(CAR_M) / 2
     turn = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
     outline = overhead.to_px((corners + [AXLE_M, 0]) @ turn.T + [x, y])

@@ -126,7 +126,12 @@ class AbstractEnvironment(ABC):
     @property
     @abstractmethod
     def state(self) -> np.ndarray:
-        """State (m,) float64, m >= 3: x, y (metres), heading (radians), others."""
+        """State (m,) float64, m >= 3: x, y (metres), heading (radians), others.
+
+        The other rows are those of the vehicle's model in `surrogate`, `mitsuba` and
+        `carla`; those of `MujocoVehicle` in `mujoco` and `mujoco_gl`; `replay` has
+        none.
+        """
 
     @property
     def is_over(self) -> bool:
@@ -209,12 +214,12 @@ def drive(
     """
     frame = environment.reset(route, np.asarray(pose, np.float64), seed)
     memory = policy.initial_memory(1)
-    states, controls = [environment.state[:3]], []
+    states, controls = [environment.state], []
     for index in range(steps):
         row, memory = policy.step(policy_image(frame.image), route.goal, memory)
         controls.append(float(np.array(row)[0]))
         frame = environment.step(controls[-1])
-        states.append(environment.state[:3])
+        states.append(environment.state)
         if on_step is not None:
             on_step(index)
         if environment.is_over:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -27,11 +28,16 @@ STEPS = {
     "cross_track_m": NUMBER,
     "departed": WHOLE,
 }
+#: Columns after them, a number each: ``state_3`` is row 3, from 0, of the state.
+STATE_ROWS = re.compile(r"state_[0-9]+")
 _REMEDY = "give the command that wrote the table again"
 
 
 def drives_table(
-    drives: Iterable[Drive], lanes: Mapping[str, Lane], **labels: Any
+    drives: Iterable[Drive],
+    lanes: Mapping[str, Lane],
+    costs: Mapping[Drive, float | None] | None = None,
+    **labels: Any,
 ) -> pd.DataFrame:
     """Return a table with one row per drive.
 
@@ -47,17 +53,25 @@ def drives_table(
     - `departed_time_s`: of the first step out; `returned_s`: of the first step in the
       lane after the last step out; NaN if there is none;
     - `start_x_m`, `start_y_m`, `start_heading_rad`: first state;
-    - `worst_time_s`, `worst_x_m`, `worst_y_m`: when and where e is largest.
+    - `worst_time_s`, `worst_x_m`, `worst_y_m`: when and where e is largest;
+    - `objective`, with `costs`: that of the drive; NaN where it is not known.
 
     Args:
         drives: in any order; lengths may differ.
         lanes: of each route.
+        costs: the scenario's objective of each drive.
         labels: further columns, such as ``attack="a1"``: a value for all rows.
 
     Raises:
         InputError: the same run twice, or a route without a lane.
     """
-    rows = [labels | _row(drive, lane_of(drive.route, lanes)) for drive in drives]
+    rows = []
+    for drive in drives:
+        row = labels | _row(drive, lane_of(drive.route, lanes))
+        if costs is not None:
+            cost = costs[drive]
+            row["objective"] = np.nan if cost is None else cost
+        rows.append(row)
     table = pd.DataFrame(rows, columns=None if rows else [*labels, *LABELS])
     if (again := table.duplicated(list(LABELS))).any():
         *where, run = table.loc[again, list(LABELS)].iloc[0]
@@ -71,7 +85,9 @@ def write_steps(
     """Write a CSV file with one row per drive and step.
 
     Row `step` t = 1..T holds the state reached at `time_s`, the control that led to
-    the state, and its signed cross-track error; `departed` is 1 beyond the limit.
+    the state, and its signed cross-track error; `departed` is 1 beyond the limit. The
+    rows of the state after the heading follow as `state_3`, `state_4`, ...; they are
+    empty where an environment has none.
     """
     parts = []
     for drive in drives:
@@ -79,8 +95,11 @@ def write_steps(
         labels = (drive.environment, drive.route, drive.case, drive.run, drive.seed)
         figures = (drive.controls, drive.cross_track_m, out)
         steps = range(1, len(out) + 1)
-        columns = (*labels, steps, drive.time_s, *drive.states[1:].T, *figures)
-        parts.append(pd.DataFrame(dict(zip(STEPS, columns, strict=True))))
+        columns = (*labels, steps, drive.time_s, *drive.poses[1:].T, *figures)
+        named = dict(zip(STEPS, columns, strict=True))
+        more = enumerate(drive.states[1:, 3:].T, start=3)
+        named |= {f"state_{row}": values for row, values in more}
+        parts.append(pd.DataFrame(named))
     write_csv(path, pd.concat(parts))
 
 
@@ -120,18 +139,23 @@ def write_csv(path: str | Path, table: pd.DataFrame) -> None:
     files.write_text(path, table.to_csv(index=False, lineterminator="\n"))
 
 
-def read_csv(path: str | Path, types: Mapping[str, str]) -> pd.DataFrame:
+def read_csv(
+    path: str | Path, types: Mapping[str, str], more: re.Pattern[str] | None = None
+) -> pd.DataFrame:
     """Read a table of :func:`write_csv`.
 
     Args:
         path: CSV file.
         types: pandas' types of all its columns; empty fields are missing values.
+        more: matches the names of further columns, of numbers.
 
     Raises:
         InputError: the file is missing, too large or damaged, or has other columns.
     """
     raw = files.read_bytes(path, MAX_BYTES)
     header = raw[: raw.find(b"\n")].decode(errors="replace").split(",")
+    if more is not None:
+        types = {**dict.fromkeys(filter(more.fullmatch, header), NUMBER), **types}
     if wrong := sorted(set(header) ^ set(types)):
         raise InputError(
             f"{path}: not a table of this kind: columns {', '.join(wrong):.200} are "
@@ -161,7 +185,7 @@ def _row(drive: Drive, lane: Lane) -> dict[str, Any]:
     out, beyond = drive.departed(lane.wheel_m), drive.departed(lane.centre_m)
     seconds = np.diff(time, prepend=0.0)
     steps, worst = np.flatnonzero(out), int(distance.argmax())
-    start, place = drive.states[0].tolist(), drive.states[1 + worst].tolist()
+    start, place = drive.poses[0].tolist(), drive.states[1 + worst].tolist()
     came_back = len(steps) > 0 and not out[-1]
     return {
         **{name: getattr(drive, name) for name in (*LABELS, "seed")},

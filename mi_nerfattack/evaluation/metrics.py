@@ -41,7 +41,10 @@ _GROUP = ["route", "environment", "case"]
 
 
 def summarise(
-    drives: Iterable[Drive], lanes: Mapping[str, Lane], seed: int = 0
+    drives: Iterable[Drive],
+    lanes: Mapping[str, Lane],
+    seed: int = 0,
+    costs: Mapping[Drive, float | None] | None = None,
 ) -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
     """Summarise drives by route, environment and case.
 
@@ -50,14 +53,16 @@ def summarise(
     - `n`: number of runs;
     - means are over the runs, each of which counts once, whatever its length;
     - `cross_track_mean_ci95_m`: of `random`, where each run has its own texture; null
-      for a single run, and for cases with one texture, however many starts they are
+      for fewer than five, and for cases with one texture, however many starts they are
       driven from, because starts say nothing about other attacks;
-    - `per_run`: the figures of each run, ordered by its index.
+    - `per_run`: the figures of each run, ordered by its index;
+    - `objective`, with `costs`: of each run, and the mean; None where one is missing.
 
     Args:
         drives: in any order; lengths may differ.
         lanes: of each route.
         seed: seed of the bootstrap.
+        costs: the scenario's objective of each drive.
 
     Returns:
         {route: {environment: {case: figures}}} of plain Python values.
@@ -65,7 +70,8 @@ def summarise(
     Raises:
         InputError: for the same run twice, or a route without a lane.
     """
-    table = drives_table(drives, lanes).sort_values("run", kind="stable")
+    table = drives_table(drives, lanes, costs).sort_values("run", kind="stable")
+    cost = () if costs is None else ("objective",)
     table["texture"] = table["run"].where(table["case"] == RANDOM, 0)
     result: dict[str, dict[str, dict[str, dict[str, Any]]]] = {}
     for row in sorted(records(summary(table, _GROUP, ["texture"], seed)), key=_order):
@@ -73,8 +79,8 @@ def summarise(
         own = table[(table[_GROUP] == [route, environment, case]).all(axis=1)]
         result.setdefault(route, {}).setdefault(environment, {})[case] = {
             "n": row["drives"],
-            **{name: row[name] for name in _OF_CASE},
-            "per_run": records(own[list(_OF_RUN)]),
+            **{name: row[name] for name in (*_OF_CASE, *cost)},
+            "per_run": records(own[[*_OF_RUN, *cost]]),
         }
     return result
 
@@ -154,6 +160,7 @@ def metrics_document(
     drives: Iterable[Drive],
     lanes: Mapping[str, Lane],
     cost: Mapping[str, float],
+    costs: Mapping[Drive, float | None] | None = None,
 ) -> dict[str, Any]:
     """Build the validated content of `metrics.json`.
 
@@ -163,11 +170,12 @@ def metrics_document(
         drives: all drives of the run, at least one.
         lanes: of each route.
         cost: `wall_s`, `peak_memory_mb`, `renders` and, as of `Effort`, more.
+        costs: the scenario's objective of each drive.
 
     Returns:
         A document for `files.write_json`.
     """
-    routes = summarise(drives, lanes, seed)
+    routes = summarise(drives, lanes, seed, costs)
     document = {
         "schema": SCHEMA,
         "scenario": dict(scenario),
@@ -212,6 +220,7 @@ class _Run(_Model):
     wheel_out_s: NonNegative
     centre_out_s: NonNegative
     returned_s: Positive | None
+    objective: float | None = None
 
 
 class _Case(_Model):
@@ -225,6 +234,7 @@ class _Case(_Model):
     drives_departed: Whole
     wheel_out_s: NonNegative
     centre_out_s: NonNegative
+    objective: float | None = None
     per_run: list[_Run]
 
     @pydantic.model_validator(mode="after")
@@ -259,6 +269,11 @@ class _Baseline(_Model):
     best: Whole
     objectives: list[float]
     attack_objective: float
+
+
+class _Objective(_Model):
+    name: str
+    missing: dict[str, str]
 
 
 class _Curve(_Model):
@@ -312,6 +327,7 @@ class _Document(_Model):
     textures: dict[str, _Texture] | None = None
     verdict: list[str] | None = None
     baseline: _Baseline | None = None
+    objective: _Objective | None = None
     curve: _Curve | None = None
     least_gain: _Gain | None = None
     bricks: _Bricks | None = None

@@ -18,9 +18,8 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.summary import (
     DEPARTED_S,
     Interval,
-    bootstrap_interval,
     interquartile_mean,
-    mean_interval,
+    interval,
     share_interval,
 )
 
@@ -38,11 +37,11 @@ class Effect:
         one: mean of one side over the attacks.
         other: of the other one.
         difference: mean of one side less the other.
-        difference_ci95: BCa over the attacks; None for a single one.
+        difference_ci95: over the attacks, see `summary.interval`; None for few.
         iqm: interquartile mean of the differences.
         iqm_ci95: likewise; None also where too few differences differ.
         ratio: of the means; None where one of the other side's is 0 or less.
-        ratio_ci95: likewise; None without a ratio or for a single attack.
+        ratio_ci95: likewise; None without a ratio or for few attacks.
         spread: standard deviation of the difference from seed to seed, pooled over the
             scenarios; None where none has two seeds.
     """
@@ -71,19 +70,19 @@ class Departures:
         one: on this side alone.
         other: on the other one alone.
         neither: on none.
-        one_ci95: of the share on this side (Wilson).
+        one_ci95: of the share on this side (Wilson); None for few attacks.
         other_ci95: on the other one.
         p_value: of a split of those on one side alone as uneven as this, were the
-            sides equal (McNemar's exact test, two-sided); 1 where there are none.
+            sides equal (McNemar's exact test, two-sided); None where there are none.
     """
 
     both: int
     one: int
     other: int
     neither: int
-    one_ci95: list[float]
-    other_ci95: list[float]
-    p_value: float
+    one_ci95: Interval
+    other_ci95: Interval
+    p_value: float | None
 
 
 def compare(
@@ -115,11 +114,11 @@ def compare(
         one=float(means[0]),
         other=float(means[1]),
         difference=float(difference.mean()),
-        difference_ci95=mean_interval(difference, seed),
+        difference_ci95=interval(np.mean, (difference,), seed),
         iqm=float(interquartile_mean(difference)),
-        iqm_ci95=bootstrap_interval(interquartile_mean, (difference,), seed),
+        iqm_ci95=interval(interquartile_mean, (difference,), seed),
         ratio=float(means[0] / means[1]) if is_positive else None,
-        ratio_ci95=bootstrap_interval(_ratio, (first, second), seed)
+        ratio_ci95=interval(_ratio, (first, second), seed, positive=True)
         if is_positive
         else None,
         spread=_spread(scenarios, difference),
@@ -149,14 +148,16 @@ def compare_departures(
     a, b = first >= least, second >= least
     alone = int((a & ~b).sum()), int((b & ~a).sum())
     total, differing = len(a), sum(alone)
-    p_value = scipy.stats.binomtest(alone[0], differing).pvalue if differing else 1.0
+    p_value = None
+    if differing:
+        p_value = float(scipy.stats.binomtest(alone[0], differing).pvalue)
     return Departures(
         int((a & b).sum()),
         *alone,
         int((~a & ~b).sum()),
         share_interval(int(a.sum()), total),
         share_interval(int(b.sum()), total),
-        float(p_value),
+        p_value,
     )
 
 

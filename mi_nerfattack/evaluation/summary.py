@@ -11,19 +11,24 @@ import numpy as np
 import pandas as pd
 
 RESAMPLES = 9999
+#: Fewer values, each independent, have no interval.
+FEWEST = 5
+#: Up to so many have a t interval, more a bootstrap: docs/report.md#intervals has the
+#: coverage of both.
+FEW = 15
 
-#: Ends of an interval; None where there is none.
+#: Ends of a 95 % interval; None where there is none.
 Interval = list[float] | None
 
 
-def share_interval(count: int, total: int) -> list[float]:
+def share_interval(count: int, total: int) -> Interval:
     """Return the lower and upper end of a share's interval (Wilson).
 
     Args:
         count: how often something happened.
-        total: of how many times, at least 1.
+        total: of how many times; None is returned for less than `FEWEST`.
     """
-    return [*_wilson(count, total)]
+    return [*_wilson(count, total)] if total >= FEWEST else None
 
 
 @cache
@@ -35,13 +40,13 @@ def _wilson(count: int, total: int) -> tuple[float, float]:
 
 
 def mean_interval(values: np.ndarray, seed: int) -> Interval:
-    """Return the interval of the mean, see :func:`bootstrap_interval`.
+    """Return the interval of the mean of positive numbers, see :func:`interval`.
 
     Args:
-        values: (n,), a number for each run.
+        values: (n,), a number for each run, at least 0.
         seed: of the resampling.
     """
-    return bootstrap_interval(np.mean, (values,), seed)
+    return interval(np.mean, (values,), seed, positive=True)
 
 
 def interquartile_mean(values: np.ndarray, axis: int = -1) -> Any:
@@ -58,25 +63,62 @@ def interquartile_mean(values: np.ndarray, axis: int = -1) -> Any:
     return scipy.stats.trim_mean(values, 0.25, axis=axis)
 
 
-def bootstrap_interval(
-    statistic: Callable[..., Any], samples: tuple[np.ndarray, ...], seed: int
+def interval(
+    statistic: Callable[..., Any],
+    samples: tuple[np.ndarray, ...],
+    seed: int,
+    positive: bool = False,
 ) -> Interval:
-    """Return an interval by resampling, bias-corrected and accelerated (BCa).
+    """Return the 95 % interval of a statistic of n independent values.
+
+    Up to `FEW` values, it is a t interval with the jackknife's standard error, which
+    for a mean is Student's own. Beyond, it is a bootstrap, bias-corrected and
+    accelerated (BCa), whose coverage is too low for few values.
 
     Args:
         statistic: of samples, along the keyword `axis`.
         samples: (n,) each; several are paired, and resampled together.
         seed: of the resampling.
+        positive: whether the statistic is positive; the t interval is then one of its
+            logarithm.
 
     Returns:
-        Its lower and upper end, which are equal where all resamples give one value.
-        None where there is none: for n = 1, and where leaving out any one of n gives
-        one value, though they differ, as the interquartile mean of 0, 0, 0, 0, 1.
+        Its lower and upper end, which are equal where all values are.
+        None where there is none: for n < `FEWEST`, and where leaving out any one of n
+        gives one value, though they differ, as the interquartile mean of
+        0, 0, 0, 0, 1.
 
-    Source: Efron, JASA 1987; `scipy.stats.bootstrap`.
+    Source: Tukey 1958; Efron, JASA 1987; `scipy.stats.bootstrap`.
     """
-    if len(samples[0]) < 2:
+    count = len(samples[0])
+    if count < FEWEST:
         return None
+    value = float(statistic(*samples))
+    if all(sample.min() == sample.max() for sample in samples):
+        return [value] * 2
+    if count > FEW:
+        return _bootstrap(statistic, samples, seed)
+    import scipy.stats
+
+    left_out = np.array(
+        [statistic(*(np.delete(s, k) for s in samples)) for k in range(count)]
+    )
+    if positive:
+        if left_out.min() <= 0:
+            return None  # its logarithm does not exist
+        value, left_out = np.log(value), np.log(left_out)
+    error = np.sqrt((count - 1) * left_out.var())
+    if error == 0:
+        return None
+    half = scipy.stats.t.ppf(0.975, count - 1) * error
+    ends = np.array([value - half, value + half])
+    return (np.exp(ends) if positive else ends).tolist()
+
+
+def _bootstrap(
+    statistic: Callable[..., Any], samples: tuple[np.ndarray, ...], seed: int
+) -> Interval:
+    """Return the BCa interval; arguments as of :func:`interval`."""
     import scipy.stats
 
     with warnings.catch_warnings(), np.errstate(invalid="ignore"):
@@ -90,9 +132,6 @@ def bootstrap_interval(
             method="BCa",
             rng=np.random.default_rng(seed),
         )
-    resampled = found.bootstrap_distribution
-    if resampled.min() == resampled.max():
-        return [float(resampled[0])] * 2
     ends = [float(end) for end in found.confidence_interval]
     return None if np.isnan(ends).any() else ends
 
@@ -102,7 +141,7 @@ DEPARTED_S = 1.0
 _ERROR, _OUT = "cross_track_mean_m", "wheel_out_s"
 _LARGEST, _STEPS = "cross_track_max_m", "steps_departed"
 #: Averaged over the drives of an attack, then over the attacks, where a table has them.
-_MEANS = ("centre_out_s", "cross_track_total", "frames")
+_MEANS = ("centre_out_s", "cross_track_total", "frames", "objective")
 _USED = (_ERROR, _OUT, _LARGEST, _STEPS, *_MEANS, "departed")
 
 
@@ -116,15 +155,15 @@ def summary(
 
     - `attacks`, `drives`: how many;
     - `cross_track_mean_m`, `cross_track_sd_m`, `cross_track_mean_ci95_m`: mean error
-      of the attacks, its standard deviation (NaN for one attack) and its BCa interval
-      (None for one attack);
+      of the attacks, its standard deviation (NaN for one attack) and its interval
+      (None for few attacks);
     - `cross_track_mean_worst_run_m`, `cross_track_max_m`: largest mean error of a
       drive, largest error of a step;
-    - `wheel_out_s`, `centre_out_s`, `cross_track_total`, `frames`: means;
+    - `wheel_out_s`, `centre_out_s`, `cross_track_total`, `frames`, `objective`: means;
     - `attacks_out`, `attacks_out_rate_ci95`: attacks whose drives have a wheel out for
       `DEPARTED_S` in the mean, and Wilson's interval of their share;
     - `steps_departed`: sum; `drives_departed`, `departure_rate_ci95`: drives that
-      leave the lane, and Wilson's interval of their share.
+      leave the lane, and Wilson's interval of their share (None for few attacks).
 
     Args:
         table: with `cross_track_mean_m`, `wheel_out_s` and `departed`; figures of
@@ -170,7 +209,10 @@ def _figures(
         "attacks_out": out,
         "attacks_out_rate_ci95": share_interval(out, count),
         "drives_departed": left,
-        "departure_rate_ci95": share_interval(left, drives),
+        # drives of few attacks are not independent, however many there are
+        "departure_rate_ci95": share_interval(left, drives)
+        if count >= FEWEST
+        else None,
     }
     found |= {name: float(means(name).mean()) for name in _MEANS if name in columns}
     if _LARGEST in columns:

@@ -12,16 +12,28 @@ from mi_nerfattack.evaluation.metrics import drives_of_run
 from mi_nerfattack.evaluation.pairs import Effect, compare
 from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, NO_OBJECT, OWN, RANDOM
 
-#: An attack beats random looks from this multiple of their mean error on.
+#: An attack beats random textures if its gain is so many times theirs.
 BEATS = 2.0
-#: It transfers if it does so in the deployment too.
-TRANSFERS = 2.0
+
+_ERROR, _OBJECTIVE = "cross_track_mean_m", "objective"
+_CHANGED = {"texture": "textures", "pose": "poses", "both": "textures and poses"}
 
 Figures = Mapping[str, Any]
 
 
 def verdict(document: Figures, surrogate: str) -> list[str]:
-    """Return sentences: policy, attack against random, transfer, convergence, texture.
+    """Return sentences: lane, policy, attack, transfer, recordings, search, texture.
+
+    By default, an attack beats random textures in an environment if its mean error
+    is at least `BEATS` times theirs.
+
+    An objective of the scenario's own can have any sign, so that differences count.
+    The gain of textures is the objective of the unattacked drives less that of the
+    drives with the textures, over drives of equal starts. An attack beats random
+    textures if its gain is positive, at least `BEATS` times their mean gain, and
+    larger than that of the best of them.
+
+    An attack that does so in a deployment transfers.
 
     Args:
         document: as of `metrics.metrics_document`, with `converged` and what follows.
@@ -30,13 +42,40 @@ def verdict(document: Figures, surrogate: str) -> list[str]:
     found = []
     for route, environments in document["routes"].items():
         limit = document["departure_limits_m"][route]
+        names = sorted(environments, key=lambda name: name != surrogate)
+        found += _lane({name: environments[name] for name in names}, limit)
         found.append(_policy(environments, limit))
-        for name in sorted(environments, key=lambda name: name != surrogate):
+        for name in names:
             found += _attack(document, name, environments[name], name == surrogate)
     for name, replayed in document.get("replay", {}).items():
         found += _replayed(name, replayed)
     found += _search(document)
     return found
+
+
+def _lane(environments: Figures, limit: float) -> Iterator[str]:
+    """Say how many attacked drives leave the lane, and by how much the others do not.
+
+    Args:
+        environments: by name, in the order of the sentence.
+        limit: departure limit, metres.
+    """
+    parts = []
+    for name, cases in environments.items():
+        if (attack := cases.get(ATTACK)) is None:
+            continue
+        left, beyond = attack["drives_departed"], attack["cross_track_max_m"] - limit
+        if left:
+            how = f"at most {beyond:.2f} m beyond the limit"
+        else:
+            how = f"{-beyond:.2f} m to spare"
+        parts.append(f"{left} of {attack['n']} drives in {name} ({how})")
+    if parts:
+        yield (
+            f"With the attacked objects, the policy leaves its lane in "
+            f"{' and in '.join(parts)}; up to {limit:.2f} m from the lane centre are "
+            "allowed."
+        )
 
 
 def _policy(environments: Figures, limit: float) -> str:
@@ -54,22 +93,27 @@ def _policy(environments: Figures, limit: float) -> str:
             f"{', '.join(departed)}; an attack proves little."
         )
     return (
-        "The policy is sound here: without objects and with them as they are it stays "
+        "The policy is sound here: without objects and with unattacked ones it stays "
         f"within {largest:.2f} m of the lane centre, where {limit:.2f} m are allowed."
     )
 
 
-def _over_starts(document: Figures, name: str) -> str:
-    """Say within what the ratio to random looks lies, by drives of equal starts."""
+def _by_starts(
+    document: Figures, environment: str, cases: tuple[str, str], figure: str
+) -> Effect:
+    """Compare two cases by drives of equal starts, each of which counts once."""
     drives = drives_of_run(document)
-    drives["scenario"] = drives["start"]  # each start counts once
-    drives = drives[drives["environment"] == name]
-    attack, random = (drives[drives["case"] == case] for case in (ATTACK, RANDOM))
-    effect = compare(attack, random, "cross_track_mean_m", document["seed"])
-    if effect.ratio_ci95 is None:
+    drives = drives[drives["environment"] == environment]
+    drives = drives.assign(scenario=drives["start"].astype(str))
+    one, other = (drives[drives["case"] == case] for case in cases)
+    return compare(one, other, figure, document["seed"])
+
+
+def _interval(ends: Sequence[float] | None, starts: int, digits: str) -> str:
+    if ends is None:
         return ""
-    low, high = effect.ratio_ci95
-    return f" (95 % interval over {effect.attacks} starts: {low:.1f} to {high:.1f})"
+    low, high = (format(end, digits) for end in ends)
+    return f" (95 % interval over {starts} starts: {low} to {high})"
 
 
 def _attack(
@@ -77,20 +121,74 @@ def _attack(
 ) -> Iterator[str]:
     if ATTACK not in cases or RANDOM not in cases:
         return
-    attack, mean = cases[ATTACK], cases[ATTACK]["cross_track_mean_m"]
-    ratio = _ratio(mean, cases[RANDOM]["cross_track_mean_m"])
-    text = f"a mean error of {mean:.3f} m, {ratio:.1f} times that of random looks"
-    text += _over_starts(document, name)
-    if BEST_RANDOM in cases:
-        best = _ratio(mean, cases[BEST_RANDOM]["cross_track_mean_m"])
-        text += f" and {best:.1f} times that of the best of them"
-    left = f"{attack['drives_departed']} of {attack['n']} drives leave the lane"
-    if is_surrogate:
-        lead = "beats" if ratio >= BEATS else "does not beat"
-        yield f"The attack {lead} random looks in the surrogate: {text}; {left}."
+    freedom = document["scenario"].get("attack", {}).get("freedom", {})
+    random = f"random {_CHANGED[freedom.get('kind', 'texture')]}"
+    objective = document.get("objective")
+    if objective is None:
+        beats, text = _by_error(document, name, cases, random)
+    elif any(cases[case].get(_OBJECTIVE) is None for case in cases):
+        why = objective["missing"].get(name, "a drive ended before the others")
+        yield f"The objective has no value in {name}, which is not judged: {why}."
+        return
+    elif OWN not in cases:
+        return
     else:
-        lead = "transfers" if ratio >= TRANSFERS else "does not transfer"
-        yield f"It {lead} to {name}: {text}; {left}."
+        beats, text = _by_objective(document, name, cases, random)
+    if is_surrogate:
+        lead = "beats" if beats else "does not beat"
+        yield f"The attack {lead} {random} in the surrogate: {text}."
+    else:
+        lead = f"It transfers to {name}"
+        if not beats:
+            lead = f"It does not transfer to {name}, where it does not beat {random}"
+        yield f"{lead}: {text}."
+
+
+def _by_error(
+    document: Figures, name: str, cases: Figures, random: str
+) -> tuple[bool, str]:
+    """Judge an attack by the mean distance from the lane centre."""
+    mean = cases[ATTACK][_ERROR]
+    ratio = _ratio(mean, cases[RANDOM][_ERROR])
+    effect = _by_starts(document, name, (ATTACK, RANDOM), _ERROR)
+    text = f"a mean error of {mean:.3f} m, {ratio:.1f} times that of {random}"
+    text += _interval(effect.ratio_ci95, effect.attacks, ".1f")
+    if BEST_RANDOM in cases:
+        best = _ratio(mean, cases[BEST_RANDOM][_ERROR])
+        text += f" and {best:.1f} times that of the best of them"
+    return ratio >= BEATS, text
+
+
+def _by_objective(
+    document: Figures, name: str, cases: Figures, random: str
+) -> tuple[bool, str]:
+    """Judge an attack by its own objective, see :func:`verdict`."""
+    gains = {
+        case: _by_starts(document, name, (OWN, case), _OBJECTIVE)
+        for case in (ATTACK, RANDOM, BEST_RANDOM)
+        if case in cases
+    }
+    gain, chance = gains[ATTACK].difference, gains[RANDOM].difference
+    values = {case: figures[_OBJECTIVE] for case, figures in cases.items()}
+    # as many digits as show three of the gain
+    digits = max(0, 2 - math.floor(math.log10(abs(gain)))) if gain else 2
+    text = (
+        f"the objective {document['objective']['name']} is {values[ATTACK]:.{digits}f} "
+        f"with it and {values[OWN]:.{digits}f} unattacked, a gain of {gain:.3g}"
+    )
+    text += _interval(gains[ATTACK].difference_ci95, gains[ATTACK].attacks, ".3g")
+    if NO_OBJECT in values:
+        text += f"; without objects it is {values[NO_OBJECT]:.{digits}f}"
+        added = values[OWN] - values[NO_OBJECT]
+        if 0 < gain <= 2 * added:  # else a share says nothing
+            text += f", so that the attack removes {gain / added:.0%} of what they add"
+    text += f"; {random} gain {chance:.3g} in the mean"
+    beats = gain > 0 and gain >= BEATS * chance
+    if BEST_RANDOM in gains:
+        best = gains[BEST_RANDOM].difference
+        text += f" and the best of them {best:.3g}"
+        beats = beats and gain > best
+    return beats, text
 
 
 def _replayed(name: str, replayed: Figures) -> Iterator[str]:
@@ -163,9 +261,13 @@ def run_flags(
     for environments in document["routes"].values():
         for name, cases in environments.items():
             yield from _random_enough(name, cases)
-            yield from _noise(name, cases)
+            yield from _noise(name, cases, document.get("objective") is not None)
     if document["converged"] is False:
-        yield from _not_converged(curve)
+        yield (
+            "not converged: when the search ended, or its learning rates fell, it was "
+            "still gaining, had gained nothing, or had done fewer than ten iterations; "
+            "raise its iterations, or frames"
+        )
     for name, texture in document["textures"].items():
         yield from _texture(name, texture)
 
@@ -228,20 +330,29 @@ def _random_enough(name: str, cases: Figures) -> Iterator[str]:
         )
 
 
-def _noise(name: str, cases: Figures) -> Iterator[str]:
-    """Compare the mean error that an attack adds with what drives of a case differ."""
+def _noise(name: str, cases: Figures, has_objective: bool) -> Iterator[str]:
+    """Compare what an attack adds to random textures with what drives of a case differ.
+
+    Args:
+        name: of the environment.
+        cases: of the environment.
+        has_objective: whether the scenario's objective counts, not the mean error.
+    """
     if cases.get(ATTACK) is None or cases.get(RANDOM) is None:
         return
-    attack, chance = (
-        np.array([run["cross_track_mean_m"] for run in cases[case]["per_run"]])
-        for case in (ATTACK, RANDOM)
-    )
-    if min(len(attack), len(chance)) < 2:
+    figure = _OBJECTIVE if has_objective else _ERROR
+    rows = [
+        [run[figure] for run in cases[case]["per_run"]] for case in (ATTACK, RANDOM)
+    ]
+    if min(map(len, rows)) < 2 or any(None in row for row in rows):
         return
-    effect = float(attack.mean() - chance.mean())
+    attack, chance = (np.array(row) for row in rows)
+    effect = float(attack.mean() - chance.mean()) * (-1 if has_objective else 1)
     noise = float(np.sqrt((attack.var(ddof=1) + chance.var(ddof=1)) / 2))
     if effect < noise:
-        yield _noise_told(f"mean error in {name} (m)", effect, noise, "drive to drive")
+        what = "objective" if has_objective else "mean error"
+        unit = "" if has_objective else " (m)"
+        yield _noise_told(f"{what} in {name}{unit}", effect, noise, "drive to drive")
 
 
 def _noise_told(what: str, effect: float, noise: float, between: str) -> str:
@@ -250,19 +361,6 @@ def _noise_told(what: str, effect: float, noise: float, between: str) -> str:
         f"standard deviation from {between} {noise:.3g}; take more starts, looks and "
         "seeds"
     )
-
-
-def _not_converged(curve: Curve | None) -> Iterator[str]:
-    text = (
-        "not converged: the search had not settled when its iterations, or frames, ran "
-        "out; raise them"
-    )
-    if curve is not None and (gain := curve["objective"][0] - curve["objective"][-1]):
-        late = _reached(curve, 0.8 * curve["frames"][-1])
-        if late is not None:
-            share = (late - curve["objective"][-1]) / gain
-            text += f"; the last fifth of the frames gave {share:.0%} of all the gain"
-    yield text
 
 
 def _texture(name: str, texture: Figures) -> Iterator[str]:

@@ -28,7 +28,7 @@ def control_changes(drives: Sequence[Drive], unit: str, seed: int) -> dict[str, 
 
     ``control_change_mean`` and ``control_change_max`` are of the distance from the
     control with own textures in the same frame, over all frames and runs; the interval
-    of the mean is a bootstrap over runs, null for a single one.
+    of the mean is over runs, null of few; see `summary.interval`.
 
     Args:
         drives: of recorded drives; of each environment one past own textures.

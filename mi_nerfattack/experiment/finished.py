@@ -93,6 +93,42 @@ class Finished:
         """The drives in closed loops."""
         return [d for d in self.drives if not self.world.is_open_loop(d.environment)]
 
+    @cached_property
+    def costs(self) -> dict[Drive, float | None]:
+        """The scenario's objective of each drive in a closed loop, by itself.
+
+        Neither the reduction over poses nor penalties on textures are in it. None where
+        `uncosted` has the drive's environment, or where the recorded drive is shorter
+        than the scenario's or lacks rows of the state.
+        """
+        return {drive: self._cost(drive) for drive in self.driven}
+
+    def _cost(self, drive: Drive) -> float | None:
+        world, size = self.world, self.world.motion.dynamics.state_size
+        states = drive.states[1:]
+        if drive.environment in self.uncosted or len(states) != world.horizon:
+            return None
+        if not world.scenario.objective.reads_all_rows:
+            states = drive.poses[1:]
+        elif states.shape[1] < size:
+            return None  # a drive that an older version recorded
+        dt = world.scenario.vehicle.dt_s
+        return float(world.objective.costs(states[None, :, :size], dt)[0])
+
+    @cached_property
+    def uncosted(self) -> dict[str, str]:
+        """Environments in which the objective has no value, and why."""
+        world = self.world
+        size, section = world.motion.dynamics.state_size, world.scenario.objective
+        if size == 3 or not section.reads_all_rows:
+            return {}
+        return {
+            label: f"the vehicle there is not the scenario's model, whose {size} rows "
+            "of the state the objective takes"
+            for label, deployment in world.deployments.items()
+            if not (deployment.moves_by_model or deployment.is_open_loop)
+        }
+
     @property
     def lane(self) -> Lane:
         """Of the route."""

@@ -50,7 +50,7 @@ def texture_figures(
     driven = next(d for d in drives if d.case == OWN and d.environment == SURROGATE)
     picked = np.unique(np.linspace(0, len(driven.states) - 1, FRAMES).astype(int))
     world.show(own)
-    states = [to_state(driven.states[None, step]) for step in picked]
+    states = [to_state(driven.poses[None, step]) for step in picked]
     weights = seen_weights(world.surrogate, world.fields, states)
     world.show(attacked)
     camera = world.surrogate.intrinsics
@@ -134,7 +134,10 @@ def _describe(done: Finished, effort: Callable[[], Effort]) -> dict[str, Any]:
     """Return the document that ``metrics.json`` holds."""
     world, scenario = done.world, done.world.scenario
     lanes = {world.route.name: done.lane}
-    more: dict[str, Any] = {"baseline": done.baseline, "flags": [*done.flags]}
+    more: dict[str, Any] = {"baseline": done.baseline}
+    if not scenario.objective.is_lane_distance:
+        name = scenario.objective.name
+        more["objective"] = {"name": name, "missing": done.uncosted}
     if replayed := done.replayed:
         unit = scenario.vehicle.car().control_unit
         more["replay"] = control_changes(replayed, unit, scenario.seed)
@@ -154,10 +157,16 @@ def _describe(done: Finished, effort: Callable[[], Effort]) -> dict[str, Any]:
         more |= {"one_level": means} if one_level else {}
     more |= texture_figures(world, done.drives, done.look(OWN), done.look(ATTACK))
     values, cost = scenario.model_dump(mode="json"), effort().model_dump()
-    document = metrics_document(values, scenario.seed, done.driven, lanes, cost) | more
+    document = metrics_document(
+        values, scenario.seed, done.driven, lanes, cost, done.costs
+    )
+    document |= more
     attack, names = done.attack, [item.id for item in scenario.objects]
     without = [names[index] for index in attack.without_gradient]
-    document["flags"] += run_flags(document, without, attack.sweeps > 1)
+    document["flags"] = [
+        *done.flags,
+        *run_flags(document, without, attack.sweeps > 1),
+    ]
     document["verdict"] = verdict(document, SURROGATE)
     validate(document)
     return document

@@ -226,7 +226,7 @@ def placed(found: FoundAttack) -> tuple[list[Pose], Views]:
         camera = sensor.intrinsics
         poses = [posed.pose for posed in sensor.objects]
     driven = [
-        drive.states
+        drive.poses
         for drive in read_drives(found.folder / DRIVES)
         if (drive.environment, drive.case) == (SURROGATE, ATTACK)
     ]

@@ -139,7 +139,7 @@ def _worst_start(found: FoundAttack) -> np.ndarray:
     ]
     if not drives:
         return found.route.pose_at(found.scenario.drive.start_m)
-    return max(drives, key=lambda drive: np.abs(drive.cross_track_m).max()).states[0]
+    return max(drives, key=lambda drive: np.abs(drive.cross_track_m).max()).poses[0]
 
 
 def _ego(start: np.ndarray, route: Route) -> Element:

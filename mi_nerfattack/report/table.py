@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,18 +41,30 @@ def metrics_table(document: Document) -> Table:
     """Return the figures of a run: a row for each route, environment and case."""
     mean, largest = _FIGURES
     figures = [
-        *(Column("runs", "n"), mean),
+        Column("runs", "n"),
+        *_objective(document),
+        mean,
         Column("95 % (m)", "cross_track_mean_ci95_m", terminal=False),
         largest,
-        Column("wheel out (s)", "wheel_out_s", 2, short="wheel\nout (s)"),
+        Column(
+            *("wheel out (s)", "wheel_out_s", 2, "wheel\nout (s)"),
+            terminal=document.get("objective") is None,  # 80 characters have no room
+        ),
         Column("centre out (s)", "centre_out_s", 2, terminal=False),
         Column("departed", "drives_departed", short="drives\nout", bad=True),
     ]
     caption = (
-        "Mean and maximum over all steps and runs. The interval of random looks is a "
-        "bootstrap over them; cases of one look have none, since their runs differ in "
-        "the start alone. Times are means over the runs; departed runs had a wheel out."
+        "Mean and maximum over all steps and runs. The interval is over random looks, "
+        "of five or more; cases of one look have none, since their runs differ in the "
+        "start alone. Times are means over the runs; departed runs had a wheel out."
     )
+    if (objective := document.get("objective")) is not None:
+        caption += (
+            f" The objective, {objective['name']}, is that of a drive, mean over the "
+            "runs; the attack makes it smaller."
+        )
+        for name, why in objective["missing"].items():
+            caption += f" It has no value in {name}: {why}."
     labels = [_ROUTE, _ENVIRONMENT, _CASE]
     return Table(_TITLE, labels, figures, list(_cases(document)), caption=caption)
 
@@ -59,13 +72,73 @@ def metrics_table(document: Document) -> Table:
 def runs_table(document: Document) -> Table:
     """Return every drive of a run: a row each."""
     figures = [
-        *(Column("run", "run"), *_FIGURES),
+        *(Column("run", "run"), *_objective(document), *_FIGURES),
         Column("wheel out (s)", "wheel_out_s", 2, bad=True),
         Column("centre out (s)", "centre_out_s", 2, bad=True),
         Column("back at (s)", "returned_s", 1),
     ]
     rows = [case | run for case in _cases(document) for run in case["per_run"]]
     return Table(_TITLE, [_ENVIRONMENT, _CASE], figures, rows)
+
+
+def overview_table(runs: Sequence[RunPart]) -> Table:
+    """Return what each run attacked and what came of it: a row for each run."""
+    figures = [
+        *(Column("policy", "policy"), Column("vehicle", "scenario.vehicle.kind")),
+        *(Column("route", "route"), Column("objects", "objects")),
+        Column("attack", "scenario.attack.method.kind"),
+        Column("attack (m)", "surrogate.attack.cross_track_mean_m"),
+        Column("times random", lambda row: _times_random(row["surrogate"]), 1),
+        *(_out(where) for where in ("surrogate", "deployments")),
+    ]
+    if any(run.document.get("objective") for run in runs):
+        for case, name in (("own", "unattacked"), ("attack", "attacked")):
+            value = partial(_objective_of, case)
+            figures.append(Column(f"objective, {name}", value))
+    caption = (
+        "What was attacked, and in the surrogate the mean distance from the lane "
+        "centre and its multiple of that with random textures; attacked drives that "
+        "leave the lane, in the surrogate and in all other environments."
+    )
+    rows = [_overview(run) for run in runs]
+    return Table("Runs", [Column("run", "run")], figures, rows, caption=caption)
+
+
+def _overview(run: RunPart) -> dict[str, Any]:
+    scenario, routes = run.document["scenario"], run.document["routes"]
+    environments = [cases for route in routes.values() for cases in route.items()]
+    sums = [sha for key, sha in run.digests.items() if key.startswith("policy.")]
+    policy = [Path(str(scenario.get("policy", {}).get("file") or "")).name]
+    others = [cases for name, cases in environments if name != "surrogate"]
+    attacked = [cases["attack"] for cases in others if "attack" in cases]
+    return {
+        "run": run.label,
+        "scenario": scenario,
+        "has_objective": run.document.get("objective") is not None,
+        "policy": " ".join([*policy, *(f"({sha[:8]})" for sha in sums)]) or None,
+        "route": ", ".join(routes),
+        "objects": ", ".join(item["id"] for item in scenario.get("objects", ())),
+        "surrogate": dict(environments).get("surrogate", {}),
+        "deployments": {
+            "attack": {
+                key: sum(figures[key] for figures in attacked)
+                for key in ("drives_departed", "n")
+            }
+            if attacked
+            else None
+        },
+    }
+
+
+def _objective_of(case: str, row: Document) -> Cell:
+    """Return a case's objective in the surrogate; a dash of the default objective."""
+    known = row["has_objective"] and case in row["surrogate"]
+    return _significant(row["surrogate"][case]["objective"] if known else None)
+
+
+def _out(where: str) -> Column:
+    keys = f"{where}.attack.drives_departed", f"{where}.attack.n", ""
+    return Column(f"out, {where}", keys, bad=True)
 
 
 def headline_table(runs: Sequence[RunPart]) -> Table:
@@ -223,7 +296,7 @@ def sweep_table(document: Document) -> Table:
     caption = (
         f"{document['complete']} of {document['cells']} attacks are done. Mean "
         "distance from the lane centre, over attacks, each of which counts once, with "
-        "standard deviation and 95 % interval (BCa bootstrap); drives with a wheel "
+        "standard deviation and, of five or more, 95 % interval; drives with a wheel "
         f"out, and attacks with one out for {document['departed_s']:g} s in the mean "
         "over their drives, with Wilson's intervals."
     )
@@ -273,6 +346,23 @@ def attacks_table(rows: Sequence[dict[str, Any]]) -> Table:
         Column("environment", _where),
     ]
     return Table(_MEAN, labels, figures, rows, caption=caption)
+
+
+def _objective(document: Document) -> list[Column]:
+    """Return the objective's column, unless it is the distance from the lane centre."""
+    if document.get("objective") is None:
+        return []
+    return [
+        Column(
+            "objective",
+            lambda row: _significant(row["objective"]),
+            short="objec-\ntive",
+        )
+    ]
+
+
+def _significant(value: float | None) -> Cell:
+    return Cell("–" if value is None else f"{value:.4g}")
 
 
 def _cases(document: Document) -> Iterator[dict[str, Any]]:

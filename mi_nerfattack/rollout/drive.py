@@ -52,9 +52,11 @@ class Drive:
         case: one of `CASES`, of ``random_case``, or `EXPERT`.
         run: index among the drives of one route, environment and case, from 0.
         seed: seed of this drive.
-        states: (T+1, 3), x and y in metres and heading in radians, initial state
-            included.
-        controls: (T,), the control that led from state t to state t+1.
+        states: (T+1, m), m >= 3, rows of the vehicle's state, initial state included:
+            x and y in metres, heading in radians, then what the vehicle adds, see
+            `AbstractEnvironment.state`. Controls that a delay holds back are no rows:
+            they are among `controls`.
+        controls: (T,), the policy's control of each period, as it came to state t+1.
         cross_track_m: (T,), signed cross-track error of `states[1:]`, metres.
         time_s: (T,), time of `states[1:]`, seconds, increasing.
 
@@ -81,7 +83,8 @@ class Drive:
         steps = np.shape(self.controls)[0] if np.ndim(self.controls) else 0
         if steps < 1:
             raise InputError("Drive.controls: no step; a drive has at least one")
-        self._freeze("states", (steps + 1, 3))
+        rows = max(3, np.shape(self.states)[-1] if np.ndim(self.states) else 0)
+        self._freeze("states", (steps + 1, rows))
         for name in ("controls", "cross_track_m", "time_s"):
             self._freeze(name, (steps,))
         if np.any(np.diff(self.time_s) <= 0):
@@ -114,6 +117,11 @@ class Drive:
             )
         array.flags.writeable = False
         object.__setattr__(self, name, array)
+
+    @property
+    def poses(self) -> np.ndarray:
+        """Return x and y in metres and heading in radians, (T+1, 3)."""
+        return self.states[:, :3]
 
     @property
     def distance_m(self) -> np.ndarray:

@@ -212,9 +212,7 @@ class Trajectory:
 
     def history(self) -> StateHistory:
         """Lay all states but the first side by side, detached."""
-        states = self.states_numpy()[:, 1:]
-        rows = to_state(states.reshape(-1, states.shape[2]))
-        return StateHistory(rows, self.count, self.horizon, self.dt)
+        return StateHistory.of(self.states_numpy()[:, 1:], self.dt)
 
 
 def simulate(

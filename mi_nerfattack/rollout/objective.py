@@ -17,6 +17,7 @@ import numpy as np
 from mi_nerfattack.backend.arrays import vjp
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import SomeShare, checked
+from mi_nerfattack.vehicle.dynamics import to_state
 
 if TYPE_CHECKING:
     from mi_nerfattack.rollout.loop import Trajectory
@@ -42,6 +43,17 @@ class StateHistory:
     count: int
     horizon: int
     dt: float
+
+    @classmethod
+    def of(cls, states: np.ndarray, dt: float) -> StateHistory:
+        """Lay the drives side by side.
+
+        Args:
+            states: (n, T, m), of each drive the state after each control period.
+            dt: control period, seconds.
+        """
+        count, horizon, size = states.shape
+        return cls(to_state(states.reshape(-1, size)), count, horizon, dt)
 
     @property
     def time(self) -> Any:
@@ -100,6 +112,15 @@ class AbstractObjective(ABC):
     @abstractmethod
     def evaluate(self, states: StateHistory) -> Any:
         """Evaluate one cost a drive, (n,), differentiable in `states.rows`."""
+
+    def costs(self, states: np.ndarray, dt: float) -> np.ndarray:
+        """Evaluate the costs of recorded drives, (n,) float64.
+
+        Args:
+            states: (n, T, m), of each drive the state after each control period.
+            dt: control period, seconds.
+        """
+        return np.array(self.evaluate(StateHistory.of(states, dt)), np.float64)
 
 
 @dataclass(frozen=True, eq=False)

@@ -139,6 +139,11 @@ class Deployment:
         return self.environment == "replay"
 
     @property
+    def moves_by_model(self) -> bool:
+        """Whether the vehicle is the scenario's model, with all rows of its state."""
+        return self.environment in ("mitsuba", "carla")
+
+    @property
     def spp(self) -> int | None:
         """Samples per pixel; None where images are not made of samples."""
         return (

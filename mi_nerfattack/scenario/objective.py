@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -60,9 +60,21 @@ Logarithm = Annotated[float, Field(ge=0, le=1)]  # of factors
 
 
 class AbstractTerm(Section):
-    """One part of the objective."""
+    """One part of the objective.
+
+    Attributes:
+        reads_all_rows: whether the cost takes all rows of the model's state, not the
+            pose alone.
+    """
 
     weight: Finite = 1.0
+
+    reads_all_rows: ClassVar[bool] = False
+
+    @property
+    def name(self) -> str:
+        """What messages call the term."""
+        return str(dict(self)["kind"])
 
     @abstractmethod
     def build(
@@ -160,6 +172,13 @@ class FunctionTerm(AbstractStageTerm):
     function: Code
     trust_code: Trust = False  # it runs with all rights of the account
 
+    reads_all_rows = True
+
+    @property
+    def name(self) -> str:
+        """The function, without the folder of its file."""
+        return self.function.name.replace("\\", "/").rpartition("/")[2]
+
     def cost(self, route: Route, dynamics: AbstractDynamics) -> StageCost:
         """Load the function and try it beside the lane, off its centre."""
         function = self.function.load("objective.term.function", self.trust_code)
@@ -186,6 +205,31 @@ class ObjectiveSection(Section):
 
     term: Annotated[tuple[Term, ...], Field(min_length=1)] = (CrossTrackTerm(),)
     reduction: Annotated[Mean | Worst | CVaR, Kinds("mean")] = Mean()
+
+    @property
+    def name(self) -> str:
+        """The terms and their weights, as verdict and pages call the objective."""
+        parts = [
+            term.name if term.weight == 1 else f"{term.weight:g} x {term.name}"
+            for term in self.term
+        ]
+        return " + ".join(parts)
+
+    @property
+    def is_lane_distance(self) -> bool:
+        """Whether the objective is the summed distance from the lane, as by default."""
+        [first, *others] = self.term
+        return (
+            isinstance(first, CrossTrackTerm | AbsoluteCrossTrackTerm)
+            and isinstance(first.weights, Uniform)
+            and first.weight > 0
+            and not others
+        )
+
+    @property
+    def reads_all_rows(self) -> bool:
+        """Whether a term takes all rows of the model's state, not the pose alone."""
+        return any(term.reads_all_rows for term in self.term)
 
     def build(
         self, scenario: Scenario, route: Route, dynamics: AbstractDynamics

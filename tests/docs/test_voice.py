@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 FOUND = {name: findings_in(name, path) for name, path in pages().items()}
 # Pages that do not pass yet, with their number of findings; it may only fall.
 PENDING = {
-    "docs/attack.md": 77,
+    "docs/attack.md": 71,
     "docs/environments.md": 26,
     "docs/fields.md": 66,
     "docs/formats.md": 2,
@@ -24,7 +24,7 @@ PENDING = {
     "docs/place.md": 13,
     "docs/plugins.md": 6,
     "docs/policy.md": 23,
-    "docs/report.md": 8,
+    "docs/report.md": 7,
     "docs/retrain.md": 53,
     "docs/robot.md": 97,
     "docs/room.md": 13,

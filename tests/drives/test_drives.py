@@ -78,6 +78,16 @@ def test_a_drive_is_found_by_what_decides_it(tmp_path):
     assert not tmp_path.exists()
 
 
+def test_all_rows_of_the_state_are_kept(tmp_path):
+    store, spec = Store(tmp_path), spec_of(0)
+    drive = straight(spec, 0.5)
+    states = np.hstack([drive.states, np.arange(8.0).reshape(4, 2)])
+    store.add(spec, replace(drive, states=states), 1.0)
+    kept = read_drive(store.path(spec))
+    np.testing.assert_array_equal(kept.states, states)
+    np.testing.assert_array_equal(kept.poses, drive.states)
+
+
 @pytest.mark.parametrize("damage", ["cut", "bit", "entries"])
 def test_a_damaged_drive_is_told(tmp_path, damage):
     store, spec = Store(tmp_path), spec_of(0)

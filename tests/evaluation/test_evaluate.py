@@ -142,19 +142,25 @@ def test_the_card_counts_drives_that_left_the_lane():
     """Limit (3.5 - 1.8) / 2 = 0.85 m: 0.8 m stays, 0.9 m left."""
     drives = [
         drive(surrogate(), Counting(), straight(), np.array([0, y, 0]), 3, 4, run=run)
-        for run, y in enumerate([0.0, 0.8, -0.9])
+        for run, y in enumerate([0.0, 0.8, -0.9, 0.8, 0.0])
     ]
     key = ("surrogate", "straight", "no_object")
     found = make_card({key: drives}, {"straight": 0.85})
     figures = found["surrogate"]["straight"]["no_object"]
-    assert (figures["n"], figures["drives_departed"]) == (3, 1)
-    assert figures["cross_track_mean_m"] == pytest.approx(1.7 / 3)
+    assert (figures["n"], figures["drives_departed"]) == (5, 1)
+    assert figures["cross_track_mean_m"] == pytest.approx(2.5 / 5)
     assert figures["cross_track_max_m"] == pytest.approx(0.9)
-    assert [run["departed"] for run in figures["per_run"]] == [False, False, True]
+    assert [run["departed"] for run in figures["per_run"]] == [
+        False,
+        False,
+        True,
+        False,
+        False,
+    ]
     last = figures["per_run"][2]
     assert last["departed_time_s"] == pytest.approx(0.1)
     assert last["start"] == [0, -0.9, 0]
-    ends = scipy.stats.binomtest(1, 3).proportion_ci(method="wilson")
+    ends = scipy.stats.binomtest(1, 5).proportion_ci(method="wilson")
     assert figures["departure_rate_ci95"] == pytest.approx(list(ends))
     json.dumps(figures, allow_nan=False)
 

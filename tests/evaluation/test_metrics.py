@@ -113,18 +113,37 @@ def test_the_mean_lies_in_its_interval():
 
 
 def test_intervals_of_few_and_of_equal_runs():
-    """A quarter of the resamples of two runs holds one of them twice.
-
-    So both 2.5 % quantiles of their mean fall on the runs' means themselves.
-    """
-    two = [make_drive([mean] * 2, run=run) for run, mean in enumerate((0.1, 0.4))]
-    assert figures_of(*two)["cross_track_mean_ci95_m"] == pytest.approx([0.1, 0.4])
-    equal = [make_drive([0.25], run=run) for run in range(4)]
+    four = [make_drive([mean], run=run) for run, mean in enumerate((0.1, 0.4, 0.5, 2))]
+    assert figures_of(*four)["cross_track_mean_ci95_m"] is None
+    equal = [make_drive([0.25], run=run) for run in range(5)]
     assert figures_of(*equal)["cross_track_mean_ci95_m"] == [0.25, 0.25]
-    assert figures_of(equal[0])["cross_track_mean_ci95_m"] is None
     for case in set(CASES) - {"random"}:  # starts alone say nothing of the policy
-        runs = [make_drive([0.1 * run], case=case, run=run) for run in range(3)]
+        runs = [make_drive([0.1 * run], case=case, run=run) for run in range(6)]
         assert figures_of(*runs)["cross_track_mean_ci95_m"] is None
+
+
+def test_a_card_of_few_drives_has_no_intervals():
+    runs = [make_drive([0.1 * run], run=run) for run in range(1, 6)]
+    few, enough = metrics.card_figures(runs[:4], 0.5), metrics.card_figures(runs, 0.5)
+    for name in ("cross_track_mean_ci95_m", "departure_rate_ci95"):
+        assert few[name] is None and enough[name] is not None
+
+
+def test_objectives_are_averaged_and_one_that_is_missing_is_no_number():
+    drives = [make_drive([0.1], run=run) for run in range(3)]
+    costs = dict(zip(drives, (-3.0, -1.0, -5.0), strict=True))
+
+    def found():
+        [figures] = metrics.summarise(drives, LANES, costs=costs)["straight"].values()
+        return figures["random"]
+
+    assert found()["objective"] == -3
+    assert [run["objective"] for run in found()["per_run"]] == [-3, -1, -5]
+    costs[drives[1]] = None
+    assert found()["objective"] is None
+    assert [run["objective"] for run in found()["per_run"]] == [-3, None, -5]
+    costs |= dict.fromkeys(drives)
+    assert found()["objective"] is None
 
 
 def test_interval_covers_the_normal_one():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import re
 
 import numpy as np
@@ -18,9 +19,9 @@ from mi_nerfattack.evaluation.verdict import (
 
 
 def case(means, departed: int = 0, largest: float = 0.2) -> dict[str, object]:
-    """Return figures of drives of mean errors, or of four that differ by a fifth."""
+    """Return figures of drives of mean errors, or of five that differ by a fifth."""
     if isinstance(means, float):
-        means = means * np.array([0.8, 1.0, 1.0, 1.2])
+        means = means * np.array([0.8, 0.9, 1.0, 1.1, 1.2])
     rows = [
         {"run": k, "seed": k, "cross_track_mean_m": mean, "steps_departed": 0}
         for k, mean in enumerate(means)
@@ -59,12 +60,14 @@ def judged():
 
 
 def test_each_sentence_says_what_the_figures_say(judged):
-    policy, attack, transfer, search, texture = verdict(judged, "surrogate")
+    lane, policy, attack, transfer, search, texture = verdict(judged, "surrogate")
     for sentence, words in (
+        (lane, ["leaves its lane in 3 of 5 drives in surrogate (at most 0.25 m"]),
+        (lane, ["0 of 5 drives in mitsuba (0.65 m to spare)", "0.85 m"]),
         (policy, ["is sound", "0.20 m", "0.85 m"]),
         # both sides by the same factor
-        (attack, ["beats", "0.300 m, 6.0 times", "4 starts: 6.0 to 6.0)"]),
-        (attack, ["3.0 times that of the best of them", "3 of 4 drives leave"]),
+        (attack, ["beats", "0.300 m, 6.0 times", "5 starts: 6.0 to 6.0)"]),
+        (attack, ["3.0 times that of the best of them"]),
         (transfer, ["does not transfer to mitsuba", "1.2 times"]),
         (search, ["converged"]),
         (texture, ["30%"]),
@@ -75,10 +78,14 @@ def test_each_sentence_says_what_the_figures_say(judged):
 def test_the_interval_is_that_of_equal_starts(judged):
     """The attack is strong from one start alone, so that its ratio is uncertain."""
     cases = judged["routes"]["right"]["surrogate"]
-    cases["attack"] = case([0.04, 0.05, 0.05, 1.06])
-    _, attack, *_ = verdict(judged, "surrogate")
+    cases["attack"] = case([0.04, 0.05, 0.05, 0.05, 1.06])
+    _, _, attack, *_ = verdict(judged, "surrogate")
     low, high = map(float, re.findall(r"starts: ([\d.]+) to ([\d.]+)\)", attack)[0])
     assert low < 1.1 and high > 10
+    for figures in cases.values():
+        figures["per_run"] = figures["per_run"][:4]
+    _, _, attack, *_ = verdict(judged, "surrogate")
+    assert "interval" not in attack
 
 
 def test_what_speaks_against_an_attack_is_said(judged):
@@ -86,9 +93,69 @@ def test_what_speaks_against_an_attack_is_said(judged):
     cases["own"], cases["attack"] = case(0.5, 4, 6.0), case(0.08)
     judged |= {"converged": False, "textures": {"ball": {"saturated_share": 0.8}}}
     judged["routes"]["right"]["mitsuba"]["attack"] = case(0.2)
-    policy, attack, transfer = verdict(judged, "surrogate")
+    _, policy, attack, transfer = verdict(judged, "surrogate")
     assert "not sound" in policy and "in surrogate (unattacked)" in policy
     assert "does not beat" in attack and "It transfers to mitsuba" in transfer
+
+
+def with_objectives(cases, **objectives):
+    """Give each drive of cases an objective; None where there is none."""
+    for name, values in objectives.items():
+        rows = cases[name]["per_run"]
+        for row, value in zip(rows, np.broadcast_to(values, len(rows)), strict=True):
+            row["objective"] = value
+        known = None not in [row["objective"] for row in rows]
+        mean = float(np.mean([row["objective"] for row in rows])) if known else None
+        cases[name]["objective"] = mean
+
+
+def objective_of(judged, attack, random=-155.0, best=-178.0):
+    """Return the sentence on an attack by an objective that is -150 unattacked."""
+    judged["objective"] = {"name": "rail.py:keeps_going", "missing": {"mitsuba": "so"}}
+    route = judged["routes"]["right"]
+    route["mitsuba"] = copy.deepcopy(route["mitsuba"])
+    own = np.array([-148, -149, -150, -151, -152])
+    shown = {"best_random": best, "random": random, "attack": attack}
+    with_objectives(route["surrogate"], no_object=-180.0, own=own, **shown)
+    names = ("no_object", "own", "random", "best_random", "attack")
+    with_objectives(route["mitsuba"], **dict.fromkeys(names))
+    _, _, sentence, missing, *_ = verdict(judged, "surrogate")
+    assert "no value in mitsuba" in missing and missing.endswith(": so.")
+    return sentence
+
+
+@pytest.mark.parametrize(
+    ("figures", "beats"),
+    [
+        ({"attack": -180.0}, True),  # a gain of 30; random textures 5, the best 28
+        ({"attack": -177.0}, False),  # the best of them gains more
+        ({"attack": -180.0, "random": -166.0}, False),  # less than twice 16
+        ({"attack": -149.0, "random": -140.0, "best": -145.0}, False),  # no gain
+        ({"attack": -151.0, "random": -140.0, "best": -145.0}, True),
+        ({"attack": 7.0, "random": 90.0, "best": 8.0}, False),
+    ],
+)
+def test_an_objective_is_judged_by_what_it_falls(judged, figures, beats):
+    sentence = objective_of(judged, **figures)
+    assert sentence.startswith("The attack beats" if beats else "The attack does not")
+
+
+def test_the_sentence_on_an_objective_has_its_numbers(judged):
+    """From -150 to -180, as without objects: all that they add."""
+    sentence = objective_of(judged, np.array([-178, -179, -180, -181, -182]))
+    words = ["keeps_going is -180.0 with it and -150.0 unattacked", "gain of 30 "]
+    words += ["over 5 starts: 30 to 30); without objects it is -180.0", "removes 100%"]
+    words += ["random textures gain 5 in the mean and the best of them 28."]
+    assert all(word in sentence for word in words), sentence
+
+
+def test_noise_is_that_of_the_objective(judged):
+    objective_of(judged, np.array([-100, -200, -150, -150, -190]), best=-150.0)
+    judged |= {"baseline": {"objectives": []}, "textures": {}}
+    flags = list(run_flags(judged, (), False))
+    [flag] = [flag for flag in flags if "objective in surrogate" in flag]
+    assert "is 3, " in flag  # from -155 to -158
+    assert not [flag for flag in flags if "mitsuba" in flag and "noise" in flag]
 
 
 @pytest.fixture
@@ -176,9 +243,10 @@ def test_seeds_that_differ_more_than_an_effect():
 
 
 def test_an_attack_that_had_more_to_gain(document):
-    """After 88 of 110 frames it is at -6, of -10 in the end and 0 before."""
+    """No share is told: the document does not hold that of the criterion."""
     document["converged"] = False
-    check(document, "not converged", "40%")
+    check(document, "not converged")
+    assert "%" not in next(run_flags(document, (), True))
     del document["curve"]  # of an attack that went on by force
     check(document, "not converged")
 

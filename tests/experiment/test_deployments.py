@@ -21,8 +21,11 @@ from support.worlds.views import write_transforms
 from mi_nerfattack.deploy import drive, make_environment
 from mi_nerfattack.deploy.carla import environment as carla_environment
 from mi_nerfattack.deploy.place import Place
+from mi_nerfattack.drives.store import read_drives
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.metrics import validate
+from mi_nerfattack.experiment.finished import Finished
+from mi_nerfattack.experiment.job import Job
 from mi_nerfattack.fields import Occupancy, load_grid, save_field
 from mi_nerfattack.fields.bricks import BrickField, Codes, vertex_count
 from mi_nerfattack.fields.one_level import OneLevel
@@ -30,10 +33,11 @@ from mi_nerfattack.io.exr import read_layers
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.camera.intrinsics import from_fov, mount_matrix
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.rollout.drive import CASES
+from mi_nerfattack.report.table import metrics_table
+from mi_nerfattack.rollout.drive import CASES, Drive
 from mi_nerfattack.rollout.loop import simulate
 from mi_nerfattack.scenario.scenario import load_scenario
-from mi_nerfattack.scenario.world import build_attack, build_world
+from mi_nerfattack.scenario.world import build_attack, build_rollout, build_world
 from tests.experiment.conftest import CAMERA
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -236,3 +240,118 @@ def test_bricks_of_a_mitsuba_scene_are_refused(bricks):
     path.write_text(text)
     with pytest.raises(InputError, match="bricks"):
         load_scenario(path)
+
+
+BRAKE = """\
+import drjit as dr
+import torch
+
+
+def car(state, pedal):
+    x, y, theta, speed = state
+    slowing = 4 * pedal + 0.3 * (speed - 4)
+    return speed * dr.cos(theta), speed * dr.sin(theta), 0 * pedal, -slowing
+
+
+def keeps_going(state):
+    return -state[3]
+
+
+class Brake(torch.nn.Module):
+    def forward(self, image, goal):
+        red = image[..., 0] - image[..., 2]
+        return 4 * torch.sigmoid(40 * (red - 0.25)).mean((1, 2)) + 0 * goal
+"""
+_TRUSTED = "trust_code = true\n"
+PEDAL = {
+    '[policy]\nfile = "policy.safetensors"\n': '[policy]\nfile = "rail.py:Brake"\n'
+    f'{_TRUSTED}goal = {{ kind = "integer", count = 3 }}\n'
+    f'[vehicle]\nkind = "custom"\nfunction = "rail.py:car"\n{_TRUSTED}'
+    "state_size = 4\ncontrol_limit = 1.0\nrest_state = [4.0]\n"
+    f'[[objective.term]]\nkind = "function"\nfunction = "rail.py:keeps_going"\n'
+    f"{_TRUSTED}",
+    "[drive]": CAMERA,
+    "horizon = 2": "horizon = 8",
+    "method.max_iterations = 30": "poses = 4\nmethod.max_iterations = 12",
+    "[7.0, 4.2, 1.6]": "[-11.0, 3.4, 1.2]",
+    "scale = 1.5": "scale = 2.0",
+}
+
+
+def test_a_verdict_says_that_an_attack_removed_the_braking(tmp_path):
+    """The object is red, the scene is not; the attack makes the object less red."""
+    folder = write_scenario(tmp_path / "scenario", PEDAL)
+    make_dense(folder)
+    item = load_grid(folder / "object.safetensors")
+    red = np.array([[1.0, -1.0, -1.0]], np.float32)
+    item.set_parameter("texture", np.repeat(red, item.n_vertices, 0))
+    save_field(folder / "object.safetensors", item)
+    scene = load_grid(folder / "scene.safetensors")
+    scene.set_parameter("texture", np.repeat(-red / 2, scene.n_vertices, 0))
+    save_field(folder / "scene.safetensors", scene)
+    (folder / "rail.py").write_text(BRAKE)
+    scenario, text = load_scenario(folder / "scenario.toml")
+    policy, output = scenario.build_policy(), tmp_path / "run"
+    document = Job(scenario, text, policy, output, frames=None).run(anyway=True)
+    name = {"name": "rail.py:keeps_going", "missing": {}}
+    assert document["objective"] == name
+    told = {(d.environment, d.case, d.run): d for d in read_drives(output / "drives")}
+    for environment, cases in document["routes"]["line"].items():
+        for case, figures in cases.items():
+            costs = [run["objective"] for run in figures["per_run"]]
+            assert figures["objective"] == pytest.approx(np.mean(costs))
+            for run, cost in enumerate(costs):
+                speeds = told[environment, case, run].states[1:, 3]
+                assert cost == pytest.approx(-speeds.sum(), abs=1e-9)
+        own, attack = (cases[case]["objective"] for case in ("own", "attack"))
+        none = cases["no_object"]["objective"]
+        assert none < own - 1 and attack < own - 0.6 * (own - none)
+    # the attack's own objective, of the same drives
+    world = build_world(scenario, policy)
+    rollout, _ = build_rollout(world)
+    costs = rollout.measure(rollout.loop.initial(world.initial)).costs
+    cases = document["routes"]["line"]["surrogate"]
+    own = [run["objective"] for run in cases["own"]["per_run"]]
+    np.testing.assert_allclose(own, costs, rtol=1e-12)
+    lane, _, attack, transfer, *_ = document["verdict"]
+    assert "0 of 2 drives in surrogate" in lane and "to spare" in lane
+    assert attack.startswith("The attack beats random textures in the surrogate")
+    assert transfer.startswith("It transfers to deployment")
+    for sentence, environment in ((attack, "surrogate"), (transfer, "deployment")):
+        cases = document["routes"]["line"][environment]
+        values = (f"{cases[case]['objective']:.2f}" for case in ("attack", "own"))
+        assert all(value in sentence for value in values), sentence
+        assert "the attack removes" in sentence
+    with open(output / "steps.csv") as lines:
+        assert {float(row["state_3"]) > 0 for row in csv.DictReader(lines)} == {True}
+    [*_, column] = [
+        c for c in metrics_table(document).figures if c.header == "objective"
+    ]
+    assert column.plain(cases["own"]) == f"{cases['own']['objective']:.4g}"
+
+
+def test_an_objective_of_other_rows_has_no_value(tmp_path):
+    """MuJoCo's car has a speed where the model has its steering angle."""
+    first, *others = PEDAL
+    model = PEDAL[first].partition("[vehicle]")[0]
+    changes = {first: model} | {key: PEDAL[key] for key in others}
+    term = '[[objective.term]]\nkind = "function"\nfunction = "rail.py:keeps_going"\n'
+    changes[TABLE] = f"{SEVERAL.partition('[[deployment]]' + chr(10) + 'name')[0]}"
+    changes["[drive]"] = f'[vehicle]\nkind = "ackermann_rate"\n{term}{_TRUSTED}{CAMERA}'
+    folder = write_scenario(tmp_path / "scenario", changes)
+    (folder / "rail.py").write_text(BRAKE)
+    scenario, _ = load_scenario(folder / "scenario.toml")
+    world = build_world(scenario, TorchPolicy(toy.SmoothPolicy()))
+    rows = {"surrogate": 4, "deployment": 6}
+    times = np.arange(1, 9) / 10
+    drives = [
+        Drive(name, "line", "own", 0, 1, np.ones((9, m)), times, times, times)
+        for name, m in rows.items()
+    ]
+    short = Drive("surrogate", "line", "own", 1, 1, np.ones((3, 4)), *[times[:2]] * 3)
+    old = Drive("surrogate", "line", "own", 2, 1, np.ones((9, 3)), *[times] * 3)
+    made = [*drives, short, old]
+    done = Finished(world, made, build_attack(world), {}, [], {}, [])
+    assert list(done.costs.values()) == [-8.0, None, None, None]
+    [(environment, why)] = done.uncosted.items()
+    assert environment == "deployment" and "4 rows" in why

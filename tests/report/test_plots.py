@@ -7,12 +7,13 @@ import io
 
 import numpy as np
 import pytest
+from support.faults.refusals import refused_at
 from support.files.runs import LANES, RUN_ENVIRONMENTS, make_drive
 from support.pages.read import drawn
 from support.worlds.places import write_place
 
 from mi_nerfattack.deploy.surrogate.scene import field_sensor
-from mi_nerfattack.drives.table import write_steps
+from mi_nerfattack.drives.table import STATE_ROWS, STEPS, read_csv, write_steps
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation import metrics
 from mi_nerfattack.fields.io import load_field
@@ -182,6 +183,18 @@ def test_steps_hold_a_row_per_step(tmp_path):
     assert float(rows[1]["control"]) == 0.1
     assert float(rows[2]["cross_track_m"]) == 1 / 3
     assert rows[2]["case"] == "attack"
+
+
+def test_steps_hold_all_rows_of_the_state(tmp_path):
+    states = np.arange(10.0).reshape(2, 5)
+    drives = [make_drive([0.1, -0.9]), make_drive([0.2], case="own", states=states)]
+    write_steps(tmp_path / "steps.csv", drives, LANES)
+    table = read_csv(tmp_path / "steps.csv", STEPS, STATE_ROWS)
+    assert list(table.columns[len(STEPS) :]) == ["state_3", "state_4"]
+    more = table[["state_3", "state_4"]].to_numpy()
+    np.testing.assert_array_equal(more, [[np.nan] * 2, [np.nan] * 2, [8, 9]])
+    with refused_at(str(tmp_path / "steps.csv")):
+        read_csv(tmp_path / "steps.csv", STEPS)
 
 
 def test_a_table_has_a_record_for_each_case():

@@ -229,7 +229,7 @@ def view_findings(world: World, first: Drive) -> Iterator[str]:
             seen, most = 0, 0.0
             for step in steps:
                 own = world.fields[k : k + 1]
-                share = changeable_share(world, own, first.states[step], int(step))
+                share = changeable_share(world, own, first.poses[step], int(step))
                 seen, most = seen + (share >= PIXELS), max(most, share)
                 if seen == needed:
                     break

@@ -200,14 +200,18 @@ def cell(figures: Figures | None) -> str:
     if figures["cross_track_sd_m"] is not None:
         mean += f" ± {figures['cross_track_sd_m']:.3f}"
     ends = interval(figures["cross_track_mean_ci95_m"])
-    low, high = (round(100 * end) for end in figures["attacks_out_rate_ci95"])
-    out = f"{figures['attacks_out']}/{count} out [{low}, {high}]"
-    return f"{mean}{ends} ({count}); {out}"
+    out = f"{figures['attacks_out']}/{count} out"
+    return f"{mean}{ends} ({count}); {out}{percent(figures['attacks_out_rate_ci95'])}"
 
 
 def interval(ends: Sequence[float] | None) -> str:
     """Return an interval after a space, or nothing."""
     return "" if ends is None else f" [{ends[0]:.3f}, {ends[1]:.3f}]"
+
+
+def percent(ends: Sequence[float] | None) -> str:
+    """Return the interval of a share in percent after a space, or nothing."""
+    return "" if ends is None else f" {[round(100 * end) for end in ends]}"
 
 
 def ratio(row: Figures | None) -> str:
@@ -311,8 +315,8 @@ def transfer_sections(drives: pd.DataFrame) -> Iterator[str]:
 def _column(column: Mapping[str, Any]) -> Sequence[str]:
     cases, transfer, kept = column["cases"], column["transfer"], ""
     if transfer is not None:
-        low, high = (round(100 * end) for end in transfer["rate_ci95"])
-        kept = f"{transfer['kept']}/{transfer['of']} [{low}, {high}]"
+        ends = percent(transfer["rate_ci95"])
+        kept = f"{transfer['kept']}/{transfer['of']}{ends}"
     ratio = column["ratio_to_surrogate"]
     return (
         column["condition"],

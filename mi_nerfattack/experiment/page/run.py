@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from mi_nerfattack.drives.store import read_drives
-from mi_nerfattack.drives.table import STEPS, read_csv, records
+from mi_nerfattack.drives.table import STATE_ROWS, STEPS, read_csv, records
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.attribution import ATTRIBUTION, UNCHANGED
 from mi_nerfattack.experiment.run_folder import (
@@ -277,7 +278,8 @@ def _pane(
 def _read_errors(path: Path) -> dict[tuple[str, str], dict[int, tuple[float, float]]]:
     """Read where first drives were, by environment and case; nothing without a file."""
     found: dict[tuple[str, str], dict[int, tuple[float, float]]] = {}
-    for row in records(read_csv(path, STEPS)) if path.is_file() else ():
+    table = read_csv(path, STEPS, STATE_ROWS) if path.is_file() else pd.DataFrame()
+    for row in records(table):
         if row["run"] == 0:
             own = found.setdefault((row["environment"], row["case"]), {})
             own[row["step"]] = row["time_s"], row["cross_track_m"]

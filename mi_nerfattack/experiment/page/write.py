@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -17,7 +18,13 @@ from mi_nerfattack.experiment.sweep.cell import CELLS
 from mi_nerfattack.experiment.sweep.table import RESULTS
 from mi_nerfattack.experiment.transfer.figures import DOCUMENT, QUALITY, read_document
 from mi_nerfattack.io import files
-from mi_nerfattack.report.pages.elements import Parts, RetrainPart, TransferPart
+from mi_nerfattack.io.resumable import flatten
+from mi_nerfattack.report.pages.elements import (
+    Parts,
+    RetrainPart,
+    RunPart,
+    TransferPart,
+)
 from mi_nerfattack.report.pages.results import write_results_page
 from mi_nerfattack.report.plots import convergence as plots
 from mi_nerfattack.rollout.drive import ATTACK
@@ -82,6 +89,8 @@ def _retraining(path: Path) -> RetrainPart:
 
 
 _MOST_BYTES = 1 << 28  # of a plot
+#: Parts of a scenario in which attacks of one curve may differ.
+_SEARCHED = ("name", "seed", "attack", "baseline", "deployment")
 #: Keys of `[attack.freedom]` that limit textures, and their largest values.
 _LIMITS = {"linf": 1.0, "l2": 1.0}
 
@@ -121,60 +130,103 @@ def _title(parts: Parts) -> str:
     return ", ".join(names) if len(names) < 4 else f"{len(names)} results"
 
 
+def _settings(parts: Parts) -> dict[str, list[RunPart]]:
+    """Return the runs by what decides about their drives, in the page's order."""
+    found: dict[str, list[RunPart]] = {}
+    for run in parts.runs:
+        found.setdefault(_setting(run), []).append(run)
+    return found
+
+
+def _setting(run: RunPart) -> str:
+    """Return what decides about a run's drives but not how its attack searched.
+
+    Scene, objects and their places, policy, camera, vehicle, starts and objective;
+    files count by their checksums.
+    """
+    scenario = run.document["scenario"].items()
+    decisive = {key: value for key, value in scenario if key not in _SEARCHED}
+    told = flatten("", decisive)
+    sums = (key.partition(": ")[0] for key in run.digests)
+    told |= dict(zip((f".{key}" for key in sums), run.digests.values(), strict=True))
+    return json.dumps(told, sort_keys=True)
+
+
+def _groups(parts: Parts) -> dict[str, Parts]:
+    """Split runs and sweeps so that the attacks of a part may share a curve.
+
+    Returns:
+        by what follows the title of a plot: runs of one setting, or one sweep, which
+        has one policy and vehicle; nothing follows where there is one part.
+    """
+    found = {
+        f": {', '.join(run.label for run in own)}": Parts(runs=own)
+        for own in _settings(parts).values()
+    }
+    found |= {f": {sweep.label}": Parts(sweeps=[sweep]) for sweep in parts.sweeps}
+    return found if len(found) > 1 else dict.fromkeys([""], parts)
+
+
 def _damage(scratch: Path, parts: Parts) -> dict[str, Path]:
-    """Plot what attacks found against its cost, a plot a route; of one, nothing."""
-    routes: dict[str, dict[str, plots.Curves]] = {}
-    for route, method, curve in _curves(parts):
-        if curve is not None:
-            routes.setdefault(route, {}).setdefault(method, []).append(curve)
+    """Plot what attacks found against its cost, a plot for each group and route."""
     found = {}
-    for route, methods in routes.items():
-        if sum(map(len, methods.values())) > 1:
-            path = scratch / f"damage_{len(found)}.png"
-            plots.damage(path, methods)
-            found[f"Damage against frames, {route}"] = path
+    for name, part in _groups(parts).items():
+        routes: dict[str, dict[str, plots.Curves]] = {}
+        for route, method, curve in _curves(part):
+            if curve is not None:
+                routes.setdefault(route, {}).setdefault(method, []).append(curve)
+        for route, methods in routes.items():
+            if sum(map(len, methods.values())) > 1:
+                path = scratch / f"damage_{len(found)}.png"
+                plots.damage(path, methods)
+                found[f"Damage against frames, {route}{name}"] = path
     return found
 
 
 def _curves(parts: Parts) -> Iterator[tuple[str, str, Any]]:
-    """Yield route, method and curve of every attack."""
+    """Yield route, method and curve of every attack; of a sweep, objects too."""
     for run in parts.runs:
         for route in run.document["routes"]:
             method = run.document["scenario"]["attack"]["method"]["kind"]
             yield route, method, run.document.get("curve")
     for sweep in parts.sweeps:
-        for attack in sweep.document["attacks"]:
+        attacks = sweep.document["attacks"]
+        several = len({attack["objects"] for attack in attacks}) > 1
+        for attack in attacks:
             words = attack["method"], attack["budget"]
             method = " ".join(str(word) for word in words if word is not None)
-            yield attack["route"], method, attack["curve"]
+            objects = f", {attack['objects']}" if several else ""
+            yield f"{attack['route']}{objects}", method, attack["curve"]
 
 
 def _by_limit(scratch: Path, parts: Parts) -> dict[str, Path]:
-    """Plot what attacks did against what their textures might change."""
+    """Plot what attacks did against what their textures might change, by group."""
     found = {}
-    for key, most in _LIMITS.items():
-        points: dict[str, list[tuple[float, float]]] = {}
-        for environment, attack, error in _attacked(parts):
-            limit = attack["freedom"].get(key)
-            at = most if limit is None else limit
-            points.setdefault(environment, []).append((at, error))
-        if len({at for own in points.values() for at, _ in own}) > 1:
-            path = scratch / f"limit_{key}.png"
-            label = f"attack.freedom.{key}, sRGB (without one: {most:g})"
-            plots.against_limit(path, label, points)
-            found[f"Damage against the texture's budget, {key}"] = path
+    for name, part in _groups(parts).items():
+        for key, most in _LIMITS.items():
+            points: dict[str, list[tuple[float, float]]] = {}
+            for line, attack, error in _attacked(part):
+                limit = attack["freedom"].get(key)
+                at = most if limit is None else limit
+                points.setdefault(line, []).append((at, error))
+            if len({at for own in points.values() for at, _ in own}) > 1:
+                path = scratch / f"limit_{len(found)}_{key}.png"
+                label = f"attack.freedom.{key}, sRGB (without one: {most:g})"
+                plots.against_limit(path, label, points)
+                found[f"Damage against the texture's budget, {key}{name}"] = path
     return found
 
 
 def _attacked(parts: Parts) -> Iterator[tuple[str, Mapping[str, Any], float]]:
-    """Yield environment, section `attack` and mean error of every attack."""
+    """Yield route and environment, section `attack` and mean error of every attack."""
     for run in parts.runs:
         section = run.document["scenario"]["attack"]
         for row in cells(run.document["routes"], "route", "environment"):
             if ATTACK in row:
                 error = row[ATTACK]["cross_track_mean_m"]
-                yield row["environment"], section, error
+                yield f"{row['route']}, {row['environment']}", section, error
     for sweep in parts.sweeps:
         for row in sweep.attacks:
             if ATTACK in row["cases"] and row["section"] is not None:
-                yield row["environment"], row["section"], row["cases"][ATTACK]
+                line = f"{row['route']}, {row['environment']}"
+                yield line, row["section"], row["cases"][ATTACK]

@@ -245,7 +245,7 @@ class Film:
         policy, route, drive = self.world.policy, self.world.route, self.drive
         memory = policy.initial_memory(1)
         watched = bool(memory)
-        frame = self.environment.reset(route, drive.states[0], drive.seed)
+        frame = self.environment.reset(route, drive.poses[0], drive.seed)
         for step in range(len(drive.controls) + 1):
             if step:
                 control = float(drive.controls[step - 1])

@@ -65,11 +65,11 @@ class FrameSource:
         if drive.environment == SURROGATE:
             world = self.viewed.world
             sensor = self._bare if case == NO_OBJECT else world.surrogate
-            seen = sensor.observe(to_state(drive.states[step][None]), step)
+            seen = sensor.observe(to_state(drive.poses[step][None]), step)
             return np.round(255 * np.array(seen.image)[0]).astype(np.uint8)
         with self._environment(drive.environment, case, bool(moved)) as environment:
             route = self.viewed.world.route
-            frame = environment.reset(route, drive.states[0], drive.seed)
+            frame = environment.reset(route, drive.poses[0], drive.seed)
             for control in drive.controls[: max(step - 1, 0)]:
                 environment.advance(float(control))
             if step:

@@ -63,7 +63,7 @@ class ViewedRun:
         Args:
             drive: of T control periods.
         """
-        return mount_matrix(drive.states, self.world.surrogate.mount)
+        return mount_matrix(drive.poses, self.world.surrogate.mount)
 
     def poses(self, case: str, moved: Mapping[int, np.ndarray]) -> list[Pose]:
         """Return where the objects stand.

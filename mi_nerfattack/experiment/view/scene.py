@@ -85,7 +85,7 @@ def read_contents(
     """
     viewed = read_viewed(folder)
     first = viewed.drive(drive)
-    cloud = scene_cloud(viewed.world, first.states, on_frame)
+    cloud = scene_cloud(viewed.world, first.poses, on_frame)
     return Contents(viewed, first, cloud, object_shapes(viewed))
 
 
@@ -258,7 +258,7 @@ def first_look(viewed: ViewedRun, drive: Drive) -> tuple[np.ndarray, np.ndarray]
     stand = [pose.translation for pose in viewed.poses(ATTACK, {})]
     target = np.mean(stand, axis=0)
     away = np.linalg.norm(drive.states[:, :2] - target[:2], axis=1)
-    x, y, heading = drive.states[np.argmax(away <= max(_NEAR_M, away.min()))]
+    x, y, heading = drive.poses[np.argmax(away <= max(_NEAR_M, away.min()))]
     back = np.array([math.cos(heading), math.sin(heading)]) * _BEHIND_M
     return np.array([*([x, y] - back), _ABOVE_M]), target
 

@@ -36,10 +36,10 @@ _CARD = (
     Column("case", "{case}"),
     Column("drives", "{n}"),
     Column("mean (m)", "{cross_track_mean_m:.3f}"),
-    Column("95 %", "{cross_track_mean_ci95_m:.3f}"),
+    Column("95 %", "cross_track_mean_ci95_m"),
     Column("largest (m)", "{cross_track_max_m:.2f}"),
     Column("drives departed", "{drives_departed}"),
-    Column("95 %", "{departure_rate_ci95:.0%} %"),
+    Column("95 %", lambda row: _percent(row["departure_rate_ci95"])),
     Column("expert, mean (m)", "{expert_m:.3f}"),
 )
 _DRIVES = (
@@ -61,11 +61,11 @@ _ROUNDS = (
     ),
 )
 _ERRORS = (
-    "Distance from the lane centre: mean over all steps of all drives, with a "
-    "bootstrap interval over drives, and the largest of any step. A drive has departed "
-    "when its distance exceeds half the lane less half the car ({}); the share of such "
-    "drives has a Wilson interval. The expert knows its position and drives from the "
-    "same starts."
+    "Distance from the lane centre: mean over all steps of all drives, with a 95 % "
+    "interval over drives, and the largest of any step. A drive has departed when its "
+    "distance exceeds half the lane less half the car ({}); the share of such drives "
+    "has a Wilson interval. Fewer than five drives have no intervals. The expert "
+    "knows its position and drives from the same starts."
 )
 _NOT_MEASURED = (
     "Times of day driven in: {}; exposures: {}. Nothing is known of all others, of "
@@ -167,6 +167,10 @@ def _training(facts: Mapping[str, Any] | None) -> list[Block]:
     shown |= {k: v for k, v in facts["settings"].items() if k not in shown}
     rounds = [{"round": i, **row} for i, row in enumerate(facts["rounds"])]
     return [_flat(shown), Table.of(rounds, _ROUNDS)]
+
+
+def _percent(ends: Sequence[float] | None) -> str:
+    return "–" if ends is None else f"{100 * ends[0]:.0f} to {100 * ends[1]:.0f} %"
 
 
 def _recorded(value: float | None) -> str:

@@ -102,9 +102,10 @@ def plot_quality(path: str | Path, document: Mapping[str, Any]) -> None:
         for number, (environment, some) in enumerate(points.items()):
             style = {**_STYLES[number % len(_STYLES)], "label": environment}
             ends = [
-                (psnr, transfer["kept"] / transfer["of"], transfer["rate_ci95"])
+                (psnr, share, transfer["rate_ci95"] or [share, share])
                 for psnr, column in some
                 if (transfer := column["transfer"])
+                for share in [transfer["kept"] / transfer["of"]]
             ]
             if environment != SURROGATE:  # 1 by definition
                 _curve(shares, ends, style)

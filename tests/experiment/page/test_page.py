@@ -15,9 +15,9 @@ from support.pages.read import PageReader
 
 from mi_nerfattack import cli
 from mi_nerfattack.experiment.page.run import read_run
-from mi_nerfattack.experiment.page.write import write_page
+from mi_nerfattack.experiment.page.write import _settings, write_page
 from mi_nerfattack.io import files
-from mi_nerfattack.report.pages.elements import SEEN, Parts
+from mi_nerfattack.report.pages.elements import SEEN, Parts, RunPart
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -114,7 +114,8 @@ def test_several_runs_stand_side_by_side(tmp_path, page_of):
         cases = document["routes"]["straight"]["surrogate"]
         shown = "no_object", "random", "attack"
         means = [cases[case]["cross_track_mean_m"] for case in shown]
-        row = next(row for row in reader.rows if row[0] == name)
+        overview, row, *_ = [row for row in reader.rows if row[0] == name]
+        assert overview[6:] == [f"{means[2]:.3f}", row[7], *["1/1"] * 2]
         assert [row[3], row[4], row[6]] == [f"{mean:.3f}" for mean in means]
         assert row[7] == f"{means[2] / means[1]:.1f}"
     plots = {i["alt"] for i in reader.images}
@@ -137,6 +138,64 @@ def test_plots_of_a_page_are_vectors_next_to_it(tmp_path, page_of, monkeypatch):
     assert [path.name for path in (tmp_path / "page_plots").iterdir()] == [
         "Damage_against_frames_straight.pdf"
     ]
+
+
+def test_other_policies_and_vehicles_have_plots_of_their_own(tmp_path, page_of):
+    attack = {"method": {"kind": "gradient"}, "freedom": {"kind": "texture"}}
+    made = {"name": "x", "objects": [], "attack": attack, "vehicle": {"dt_s": 0.1}}
+    for name, changes in (
+        ("one", {"seed": 1}),
+        (
+            "two",
+            {
+                "seed": 2,
+                "attack": {**attack, "freedom": {"kind": "texture", "linf": 0.1}},
+            },
+        ),
+        ("other", {"policy": {"file": "another.pt2"}}),
+        ("bicycle", {"vehicle": {"dt_s": 0.1, "kind": "bicycle"}}),
+    ):
+        make_run(tmp_path / name, pictures=False, flags=[], scenario=made | changes)
+    _, reader = page_of("one", "two", "other", "bicycle")
+    plots = [i["alt"] for i in reader.images if i["alt"].startswith("Damage")]
+    assert plots == [
+        "Damage against frames, straight: one, two",
+        "Damage against the texture's budget, linf: one, two",
+    ]
+    lines = [row[:3] for row in reader.rows if row[0] in ("other", "bicycle")]
+    assert lines[:2] == [["other", "another.pt2", "–"], ["bicycle", "–", "bicycle"]]
+
+
+def test_objectives_stand_in_the_line_of_a_run(tmp_path, page_of):
+    for name in ("one", "other"):
+        make_run(tmp_path / name, pictures=False)
+    path = tmp_path / "other" / "metrics.json"
+    document = files.read_json(path)
+    document["objective"] = {"name": "rail.py:slow", "missing": {"deployment": "why"}}
+    for environment, cases in document["routes"]["straight"].items():
+        for number, figures in enumerate(cases.values()):
+            value = -1.5 * number if environment == "surrogate" else None
+            figures["objective"] = value
+            for run in figures["per_run"]:
+                run["objective"] = value
+    files.write_json(path, document)
+    _, reader = page_of("one", "other")
+    lines = [next(row for row in reader.rows if row[0] == k) for k in ("one", "other")]
+    assert [line[-2:] for line in lines] == [["–", "–"], ["-1.5", "-4.5"]]
+    assert "It has no value in deployment: why." in reader.text
+
+
+def test_files_of_a_scenario_count_by_their_checksums():
+    def run(label, digest, file):
+        scenario = {"policy": {"file": file}, "name": label}
+        digests = {f"policy.file: {file}": digest}
+        more = {"pictures": {}, "scrubbers": {}, "missing": {}, "repeat": ""}
+        about = {"scenario": "", "made_with": {}, "digests": digests}
+        return RunPart(label, {"scenario": scenario}, **about, **more)
+
+    runs = [run("x", "1", "a.pt2"), run("y", "2", "a.pt2"), run("z", "1", "b.pt2")]
+    labels = [[r.label for r in own] for own in _settings(Parts(runs=runs)).values()]
+    assert labels == [["x", "z"], ["y"]]
 
 
 def test_transfers_and_retrainings_are_tables(tmp_path, page_of):

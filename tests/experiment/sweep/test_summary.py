@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
-import scipy.stats
 
-from mi_nerfattack.evaluation.summary import mean_interval
 from mi_nerfattack.experiment.sweep.summary import summarise
 from mi_nerfattack.experiment.sweep.table import make_table, with_total
 
@@ -77,13 +74,11 @@ def test_groups_by_hand():
     assert right["cross_track_mean_m"] == pytest.approx((0.5 + 0.9) / 2)
     assert right["cross_track_sd_m"] == pytest.approx(math.sqrt(2 * 0.2**2))
     assert right["cross_track_total"] == pytest.approx(7.0)
-    ends = mean_interval(np.array([0.5, 0.9]), 0)
-    assert right["cross_track_mean_ci95_m"] == pytest.approx(ends)
     # 0.95 s and 1.25 s on average; a wheel is out in 3 of 4 drives
     out = [right[name] for name in ("attacks_out", "drives_departed", "drives")]
     assert out == [1, 3, 4]
-    ends = scipy.stats.binomtest(3, 4).proportion_ci(method="wilson")
-    assert right["departure_rate_ci95"] == pytest.approx(list(ends))
+    few = "cross_track_mean_ci95_m", "attacks_out_rate_ci95", "departure_rate_ci95"
+    assert [right[name] for name in few] == [None] * 3
     together = pick(found["groups"], route=None, **wanted)
     assert together["cross_track_mean_m"] == pytest.approx((0.5 + 0.9 + 1.3) / 3)
     assert (together["attacks"], together["places"], together["seeds"]) == (3, 2, 2)
