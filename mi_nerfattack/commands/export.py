@@ -175,6 +175,7 @@ class ExportScreen(ScreenOptions):
         files.check_writable(path)
         variant.ensure()
         box, views = read_box(self.run_folder, self.box)
+        box.check_face(self.face)
         face = self.face or seen_most(box, views)
         edges = box.edges_mm(self.size_mm)
         spot = Net(edges, box.sheet).faces[face]

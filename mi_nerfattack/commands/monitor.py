@@ -125,6 +125,7 @@ class Monitor(ScreenOptions):
         from mi_nerfattack.props.follow import StandingScreen
 
         if self.screen is None:
+            box.check_face(self.face)
             face = self.face or seen_most(box, views)
             return StandingScreen.on_face(screen, box, face)
         if self.face is not None:

@@ -16,6 +16,9 @@ FEWEST = 5
 #: Up to so many have a t interval, more a bootstrap: docs/report.md#intervals has the
 #: coverage of both.
 FEW = 15
+#: Largest standard error of a logarithm for a t interval of it: with more, as of values
+#: that are all or nothing, such an interval reaches over orders of magnitude.
+LOGARITHM = 0.5
 
 #: Ends of a 95 % interval; None where there is none.
 Interval = list[float] | None
@@ -80,7 +83,8 @@ def interval(
         samples: (n,) each; several are paired, and resampled together.
         seed: of the resampling.
         positive: whether the statistic is positive; the t interval is then one of its
-            logarithm.
+            logarithm if the error of the logarithm is `LOGARITHM` at most, and else
+            ends at 0.
 
     Returns:
         Its lower and upper end, which are equal where all values are.
@@ -103,16 +107,21 @@ def interval(
     left_out = np.array(
         [statistic(*(np.delete(s, k) for s in samples)) for k in range(count)]
     )
-    if positive:
-        if left_out.min() <= 0:
-            return None  # its logarithm does not exist
-        value, left_out = np.log(value), np.log(left_out)
-    error = np.sqrt((count - 1) * left_out.var())
-    if error == 0:
+    quantile = float(scipy.stats.t.ppf(0.975, count - 1))
+    if positive and left_out.min() > 0:
+        error = _jackknife(np.log(left_out))
+        if 0 < error <= LOGARITHM:
+            factor = float(np.exp(quantile * error))
+            return [value / factor, value * factor]
+    if (error := _jackknife(left_out)) == 0:
         return None
-    half = scipy.stats.t.ppf(0.975, count - 1) * error
-    ends = np.array([value - half, value + half])
-    return (np.exp(ends) if positive else ends).tolist()
+    low, high = value - quantile * error, value + quantile * error
+    return [max(low, 0.0) if positive else low, high]
+
+
+def _jackknife(left_out: np.ndarray) -> float:
+    """Return the standard error from statistics (n,) without one value each."""
+    return float(np.sqrt((len(left_out) - 1) * left_out.var()))
 
 
 def _bootstrap(

@@ -98,26 +98,42 @@ class Finished:
         """The scenario's objective of each drive in a closed loop, by itself.
 
         Neither the reduction over poses nor penalties on textures are in it. None where
-        `uncosted` has the drive's environment, or where the recorded drive is shorter
-        than the scenario's or lacks rows of the state.
+        it has no value, of which `uncosted` says why.
         """
-        return {drive: self._cost(drive) for drive in self.driven}
-
-    def _cost(self, drive: Drive) -> float | None:
-        world, size = self.world, self.world.motion.dynamics.state_size
-        states = drive.states[1:]
-        if drive.environment in self.uncosted or len(states) != world.horizon:
-            return None
-        if not world.scenario.objective.reads_all_rows:
-            states = drive.poses[1:]
-        elif states.shape[1] < size:
-            return None  # a drive that an older version recorded
-        dt = world.scenario.vehicle.dt_s
-        return float(world.objective.costs(states[None, :, :size], dt)[0])
+        found = {drive: self._cost(drive) for drive in self.driven}
+        return {k: None if isinstance(v, str) else v for k, v in found.items()}
 
     @cached_property
     def uncosted(self) -> dict[str, str]:
-        """Environments in which the objective has no value, and why."""
+        """Environments in which the objective of a drive has no value, and why."""
+        found = dict(self._other_models)
+        for drive in self.driven:
+            if isinstance(reason := self._cost(drive), str):
+                found.setdefault(drive.environment, reason)
+        return found
+
+    def _cost(self, drive: Drive) -> float | str:
+        """Return the objective of a drive, or why there is none."""
+        world, size = self.world, self.world.motion.dynamics.state_size
+        states = drive.states[1:]
+        if reason := self._other_models.get(drive.environment):
+            return reason
+        if len(states) != world.horizon:
+            return "a drive ended before the others"
+        if not world.scenario.objective.reads_all_rows:
+            states = drive.poses[1:]
+        elif states.shape[1] < size:
+            return (
+                f"an older version recorded {states.shape[1]} of the state's {size} "
+                "rows; remove the folder drives, and give the command again"
+            )
+        dt = world.scenario.vehicle.dt_s
+        cost = float(world.objective.costs(states[None, :, :size], dt)[0])
+        return cost if np.isfinite(cost) else f"it is {cost} for a drive"
+
+    @cached_property
+    def _other_models(self) -> dict[str, str]:
+        """Environments whose vehicle lacks what the objective reads, and why."""
         world = self.world
         size, section = world.motion.dynamics.state_size, world.scenario.objective
         if size == 3 or not section.reads_all_rows:

@@ -42,7 +42,7 @@ class Course:
         camera: of the scenario, for recordings without intrinsics.
         mount: of the camera on the vehicle.
         period: seconds between two controls.
-        control_unit: "rad/s" of a heading rate, or "rad" of a steering angle.
+        control_unit: "rad" of a steering angle; drives have heading rates of others.
         wheelbase: metres.
     """
 
@@ -101,13 +101,14 @@ class Course:
             times: (n,), seconds, increasing.
 
         Returns:
-            (n - 1,), in `control_unit`, positive to the left.
+            (n - 1,), radians of steering if that is `control_unit`, else radians per
+            second of heading; positive to the left.
 
         Source: appendix A.7 and A.8.
         """
         turn = np.diff(states[:, 2])
         turn = np.arctan2(np.sin(turn), np.cos(turn))
-        if self.control_unit == "rad/s":
+        if self.control_unit != "rad":
             return turn / np.diff(times)
         way = np.hypot(*np.diff(states[:, :2], axis=0).T)
         return steering_angle(turn, way, self.wheelbase)

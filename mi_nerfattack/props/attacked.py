@@ -73,6 +73,22 @@ class AttackedBox:
         """Edge lengths along the box's own axes in the world, (3,), metres."""
         return self.pose.scale * (self.upper - self.lower)
 
+    @property
+    def faces(self) -> tuple[str, ...]:
+        """Names of the faces that show pictures."""
+        return tuple(FACES) if self.sheet is None else (self.sheet,)
+
+    def check_face(self, face: str | None) -> None:
+        """Refuse a face that shows nothing; None is any.
+
+        Raises:
+            InputError: the box is flat, and this is another face.
+        """
+        if face is not None and face not in self.faces:
+            raise InputError(
+                f"--face: {face}; {self.name} is flat and has {self.sheet} alone"
+            )
+
     def edges_mm(self, longest_mm: float | None) -> np.ndarray:
         """Return the edges (3,), millimetres, of a copy whose longest is given.
 

@@ -19,7 +19,7 @@ from mi_nerfattack.car.devices import (
     TrackedPose,
 )
 from mi_nerfattack.io.network import Endpoint, HttpServer
-from mi_nerfattack.props.attacked import FACES, AttackedBox
+from mi_nerfattack.props.attacked import AttackedBox
 from mi_nerfattack.props.monitor import Screen, levels_sent
 from mi_nerfattack.report.pages.elements import address, render
 
@@ -96,7 +96,7 @@ def seen_faces(
     if (eye - standing.middle) @ facing <= 0:
         return {}
     to_pixels, found = np.linalg.inv(standing.rays(eye)), {}
-    for face in FACES:
+    for face in box.faces:
         corner, across, down = box.plane(face)
         if (eye - corner) @ np.cross(down, across) > 0:
             found[face] = to_pixels @ np.stack([across, down, corner - eye], axis=1)

@@ -10,7 +10,7 @@ import numpy as np
 
 from mi_nerfattack.backend.colour import linear_to_uint8, srgb_to_linear_numpy
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.props.attacked import FACES, AttackedBox
+from mi_nerfattack.props.attacked import AttackedBox
 from mi_nerfattack.render.camera.distortion import jacobian
 from mi_nerfattack.render.camera.intrinsics import Camera, ray_lengths, ray_slopes
 from mi_nerfattack.system.extras import load_extra
@@ -54,8 +54,8 @@ class Overlay:
         self._spans = (x.min(0), x.max(0)), (y.min(1), y.max(1))
         self._stretch = stretch.astype(np.float32)
         self._lengths = ray_lengths(camera).astype(np.float32)
-        self._planes = {face: box.plane(face) for face in FACES}
-        self._pictures = {face: self._reduced(box.images[face]) for face in FACES}
+        self._planes = {face: box.plane(face) for face in box.faces}
+        self._pictures = {face: self._reduced(box.images[face]) for face in box.faces}
 
     def apply(
         self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -16,6 +16,9 @@ from mi_nerfattack.ranges import Finite, Positive
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.scenario.named_file import File, NamedFile
 from mi_nerfattack.scenario.section import Kinds, Section, refuse
+
+if TYPE_CHECKING:
+    from mi_nerfattack.capture.mesh.flat import FlatObject
 
 Triple = tuple[Finite, Finite, Finite]
 
@@ -99,7 +102,7 @@ class FlatObjectSection(AbstractObjectSection):
             picture = files.read_image(self.picture.file)[..., :3]
         return self._flat().field(picture)
 
-    def _flat(self) -> Any:
+    def _flat(self) -> FlatObject:
         from mi_nerfattack.capture.mesh.flat import FlatObject  # most have none
 
         return FlatObject(

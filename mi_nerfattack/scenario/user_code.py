@@ -123,12 +123,23 @@ def _imported(package: str, path: Path) -> Iterator[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.Assign) and path.name == "__init__.py":
+            yield from (f"{package}.{name}" for name in _offered(node))
         elif isinstance(node, ast.ImportFrom):
             above = package if node.level else ""
             for _ in range(node.level - 1):
                 above = _parent(above)
             for alias in node.names:
                 yield ".".join(filter(None, (above, node.module, alias.name)))
+
+
+def _offered(node: ast.Assign) -> Iterator[str]:
+    """Yield the names of `__all__`, which `import *` imports."""
+    targets = [target.id for target in node.targets if isinstance(target, ast.Name)]
+    if "__all__" in targets and isinstance(node.value, ast.List | ast.Tuple):
+        for item in node.value.elts:
+            if isinstance(item, ast.Constant) and isinstance(item.value, str):
+                yield item.value
 
 
 def _parent(name: str) -> str:
@@ -158,7 +169,8 @@ class _Helpers:
         del path, target
         if (file := cls.files.get(name)) is None:
             return None
-        inside: list[str] | None = [] if file.name == "__init__.py" else None
+        # A folder that no other finder knows, so that only helpers are found inside
+        inside = ["<helpers>"] if file.name == "__init__.py" else None
         return importlib.util.spec_from_file_location(
             name,
             file,

@@ -117,7 +117,14 @@ def test_one_that_differs_does_not_tell_the_interval_of_the_quartiles():
     assert interquartile_mean(values) == 0
     assert interval(interquartile_mean, (values,), 0) is None
     assert interval(np.mean, (values,), 0) is not None
-    assert mean_interval(values, 0) is None  # without the one there is no logarithm
+    # Without the one there is no logarithm: Student's interval, which ends at 0
+    half = 2.7764451 * math.sqrt(0.2 / 5)
+    assert mean_interval(values, 0) == pytest.approx([0, 0.2 + half])
+    # A logarithm whose error spans orders of magnitude is not taken, either
+    values = np.array([0.05, 0.06, 0.05, 0.07, 5.5])
+    half = 2.7764451 * float(np.std(values, ddof=1)) / math.sqrt(5)
+    ends = [max(values.mean() - half, 0), values.mean() + half]
+    assert mean_interval(values, 0) == pytest.approx(ends)
     assert interquartile_mean(np.array([0.0, 0.0, 3.0])) == 1  # no quarter of three
 
 

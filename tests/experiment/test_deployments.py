@@ -330,7 +330,7 @@ def test_a_verdict_says_that_an_attack_removed_the_braking(tmp_path):
     assert column.plain(cases["own"]) == f"{cases['own']['objective']:.4g}"
 
 
-def test_an_objective_of_other_rows_has_no_value(tmp_path):
+def test_an_objective_of_other_rows_has_no_value(tmp_path, monkeypatch):
     """MuJoCo's car has a speed where the model has its steering angle."""
     first, *others = PEDAL
     model = PEDAL[first].partition("[vehicle]")[0]
@@ -353,5 +353,13 @@ def test_an_objective_of_other_rows_has_no_value(tmp_path):
     made = [*drives, short, old]
     done = Finished(world, made, build_attack(world), {}, [], {}, [])
     assert list(done.costs.values()) == [-8.0, None, None, None]
-    [(environment, why)] = done.uncosted.items()
-    assert environment == "deployment" and "4 rows" in why
+    assert set(done.uncosted) == {"deployment", "surrogate"}
+    assert "4 rows" in done.uncosted["deployment"]
+    assert "ended before" in done.uncosted["surrogate"]
+    done = Finished(world, [old], build_attack(world), {}, [], {}, [])
+    assert "older version recorded 3" in done.uncosted["surrogate"]
+    kind = type(world.objective)
+    monkeypatch.setattr(kind, "costs", lambda *_: np.array([np.inf]))
+    done = Finished(world, made, build_attack(world), {}, [], {}, [])
+    assert list(done.costs.values()) == [None] * 4
+    assert done.uncosted["surrogate"] == "it is inf for a drive"

@@ -66,6 +66,8 @@ def test_a_billboard_of_a_run_is_its_front(tmp_path):
     box, views = read_box(run, texture_px=24)
     assert box.sheet == "front" == seen_most(box, views)
     assert box.images["front"].shape == (12, 24, 3)
+    with pytest.raises(InputError, match="--face: back; ball is flat"):
+        box.check_face("back")
 
 
 def test_the_face_that_is_seen_most():

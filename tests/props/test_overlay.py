@@ -7,6 +7,8 @@ boundary the pixel is; all other pixels are checked, in every pose.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation, distance_transform_edt
@@ -125,6 +127,24 @@ def test_within_a_pixel_of_a_render(camera):
     assert edges.max() <= 1
     assert checks.max() <= 1
     assert pixels.sum() > 3e4
+
+
+def test_a_flat_object_shows_one_face():
+    box = checked_box()
+    flat = replace(box, sheet="front")
+    frame = np.full((LENS.height, LENS.width, 3), 128, np.uint8)
+    counts = []
+    for matrix in poses(12):
+        one, other = (
+            (Overlay(b, LENS, keyed=False).apply(frame, matrix) != 128).any(-1)
+            for b in (flat, box)
+        )
+        assert not (one & ~other).any()
+        corner, across, down = box.plane("front")
+        is_seen = (matrix[:3, 3] - corner) @ np.cross(down, across) > 0
+        assert one.any() == (is_seen and other.any())
+        counts.append((int(one.sum()), int(other.sum())))
+    assert 0 < sum(few for few, _ in counts) < sum(many for _, many in counts)
 
 
 @pytest.mark.slow

@@ -73,14 +73,31 @@ def test_every_helper_counts_and_no_other_file(tmp_path):
     assert named.content() == first
 
 
+def test_what_a_package_offers_to_a_star_counts(tmp_path):
+    star = "from parts import *\ndef control(x): return sub.NUMBER * x\n"
+    files = {"uses.py": star, "parts/__init__.py": "__all__ = ['sub']\n"}
+    path = write(tmp_path, **files, **{"parts/sub.py": "NUMBER = 7\n"})
+    assert load_function(path, "control")(1) == 7
+    named = NamedFile("uses.py:control", path, "control")
+    before = named.content()
+    write(tmp_path, **files, **{"parts/sub.py": "NUMBER = 8\n"})
+    assert named.content() != before
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
+        (
+            "parts/__init__.py",
+            "import importlib as i\ni.import_module('.lost', __name__)\n",
+            "ModuleNotFoundError: .*lost",
+        ),
         ("scale.py", "import nowhere", "ModuleNotFoundError: .*'nowhere'; install it"),
         ("scale.py", "def (", r"uses.py: raised SyntaxError: .*scale.py, line 1"),
         ("uses.py", "from ..uses import f", "uses.py: raised ImportError"),
     ],
 )
 def test_what_is_wrong_is_told(tmp_path, name, text, message):
+    path = write(tmp_path, **{"parts/lost.py": "", name: text})
     with pytest.raises(InputError, match=message):
-        load_function(write(tmp_path, **{name: text}), "control")
+        load_function(path, "control")

@@ -15,7 +15,8 @@ from mi_nerfattack.fields.occupancy import Occupancy
 #: Pixels along an edge, at most: the lattice of a grid field is a cube.
 MOST_PIXELS = 256
 
-_THICKNESS = 0.01  # of the box, of its longer edge
+_THICKNESS = 0.01  # of the box, share of its longer edge,
+_MOST_M = 0.04  # and metres, at most
 _STEPS = 8  # of the march, through the sheet at right angles
 _STEP_DEPTH = 12.0  # optical depth of a step, which is opaque
 _RANGE = 1 / 512  # sRGB, from 0 and from 1, which no sigmoid reaches
@@ -103,7 +104,7 @@ class FlatObject:
 
     @property
     def _thickness(self) -> float:
-        return _THICKNESS * self._longest
+        return min(_THICKNESS * self._longest, _MOST_M)
 
     def _texture(self, picture: np.ndarray, field: GridField) -> np.ndarray:
         """Return raw colours (n_vertices, 3) that show a picture, at any depth."""

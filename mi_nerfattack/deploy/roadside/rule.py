@@ -102,9 +102,10 @@ class Roadside:
             begin, end = stretch
             raise InputError(
                 f"route {route.name!r}: places for {len(found)} of {len(fields)} "
-                f"objects, off the lanes, on free ground and in view for {self.view_s} "
-                f"s of a drive from {begin:.1f} to {end:.1f} m of it; ask for fewer or "
-                "other sizes of them, or move routes or obstacles"
+                "objects, off the lanes (patches within one), on free ground and in "
+                f"view for {self.view_s} s of a drive from {begin:.1f} to {end:.1f} m "
+                "of it; ask for fewer or other sizes of them, or move routes or "
+                "obstacles"
             )
         return found
 
@@ -167,8 +168,8 @@ class Roadside:
         half = scale[:, None] * shape.size[:2] / 2
         reach = half[:, 0] * np.abs(np.sin(turn)) + half[:, 1] * np.abs(np.cos(turn))
         if shape.is_patch:
-            free = np.maximum(route.lane_width_m / 2 - reach, 0)
-            lateral = free * rng.uniform(size=_TRIES)
+            free = route.lane_width_m / 2 - reach
+            lateral = np.where(free < 0, np.inf, free * rng.uniform(size=_TRIES))
         else:
             lateral = surroundings.kerb(route, arc, side) + gap + reach
         known = np.isfinite(lateral)
@@ -201,7 +202,8 @@ class Roadside:
             stands = stands[~surroundings.on_lanes(outline, self.gap_m[0])]
         if not len(stands):
             return stands
-        return stands[surroundings.stand_free(stands, step, self.clearance_m)]
+        around = 0.0 if stands.shape.is_patch else self.clearance_m
+        return stands[surroundings.stand_free(stands, step, around)]
 
     def _seen(
         self,

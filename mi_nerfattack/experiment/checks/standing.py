@@ -53,7 +53,11 @@ class Solid:
 
     @staticmethod
     def of(name: str, posed: PosedField) -> Solid:
-        """Find the solid points of an object as it is placed."""
+        """Find the solid points of an object as it is placed.
+
+        Raises:
+            InputError: no cell of the field is occupied.
+        """
         field = posed.field
         box = field.upper - field.lower
         lower, upper = field.lower + box * field.occupancy.bounds

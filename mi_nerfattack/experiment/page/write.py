@@ -18,7 +18,6 @@ from mi_nerfattack.experiment.sweep.cell import CELLS
 from mi_nerfattack.experiment.sweep.table import RESULTS
 from mi_nerfattack.experiment.transfer.figures import DOCUMENT, QUALITY, read_document
 from mi_nerfattack.io import files
-from mi_nerfattack.io.resumable import flatten
 from mi_nerfattack.report.pages.elements import (
     Parts,
     RetrainPart,
@@ -33,6 +32,7 @@ _KINDS = (
     "give run folders of 'mi-nerfattack attack', folders of 'sweep' and 'transfer', "
     "and NAME-retrain.json of 'retrain'"
 )
+_KIND = re.compile(r"\.objects\[\d+\]\.kind")
 _RETRAINED = {"policy", "runs", "held_out", "left_out", "table"}
 
 
@@ -89,8 +89,8 @@ def _retraining(path: Path) -> RetrainPart:
 
 
 _MOST_BYTES = 1 << 28  # of a plot
-#: Parts of a scenario in which attacks of one curve may differ.
-_SEARCHED = ("name", "seed", "attack", "baseline", "deployment")
+#: Parts of a scenario that decide how an attack searched, not what it attacked.
+_SEARCHED = ("name", "seed", "attack", "baseline")
 #: Keys of `[attack.freedom]` that limit textures, and their largest values.
 _LIMITS = {"linf": 1.0, "l2": 1.0}
 
@@ -130,30 +130,56 @@ def _title(parts: Parts) -> str:
     return ", ".join(names) if len(names) < 4 else f"{len(names)} results"
 
 
-def _settings(parts: Parts) -> dict[str, list[RunPart]]:
-    """Return the runs by what decides about their drives, in the page's order."""
+def _settings(parts: Parts, deployed: bool) -> dict[str, list[RunPart]]:
+    """Return the runs by what decides about their drives, in the page's order.
+
+    Args:
+        parts: of the page.
+        deployed: whether drives in deployments count.
+    """
     found: dict[str, list[RunPart]] = {}
     for run in parts.runs:
-        found.setdefault(_setting(run), []).append(run)
+        found.setdefault(_setting(run, deployed), []).append(run)
     return found
 
 
-def _setting(run: RunPart) -> str:
+def _setting(run: RunPart, deployed: bool) -> str:
     """Return what decides about a run's drives but not how its attack searched.
 
     Scene, objects and their places, policy, camera, vehicle, starts and objective;
     files count by their checksums.
     """
+    without = _SEARCHED if deployed else (*_SEARCHED, "deployment")
     scenario = run.document["scenario"].items()
-    decisive = {key: value for key, value in scenario if key not in _SEARCHED}
-    told = flatten("", decisive)
-    sums = (key.partition(": ")[0] for key in run.digests)
-    told |= dict(zip((f".{key}" for key in sums), run.digests.values(), strict=True))
-    return json.dumps(told, sort_keys=True)
+    values = dict(_values("", {k: v for k, v in scenario if k not in without}))
+    # The kind of an object that is a file; older runs do not say it
+    values = {k: v for k, v in values.items() if not (_KIND.match(k) and v == "field")}
+    for key, digest in run.digests.items():
+        name = f".{key.partition(': ')[0]}"
+        if name.startswith(tuple(f".{section}" for section in without)):
+            continue
+        values[name] = digest
+    return json.dumps(values, sort_keys=True)
 
 
-def _groups(parts: Parts) -> dict[str, Parts]:
+def _values(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the values of a document by names such as ``.objects[0].field``."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _values(f"{name}.{key}", item)
+    elif isinstance(value, list) and any(isinstance(item, dict) for item in value):
+        for index, item in enumerate(value):
+            yield from _values(f"{name}[{index}]", item)
+    else:
+        yield name, value
+
+
+def _groups(parts: Parts, deployed: bool) -> dict[str, Parts]:
     """Split runs and sweeps so that the attacks of a part may share a curve.
+
+    Args:
+        parts: of the page.
+        deployed: as of :func:`_settings`.
 
     Returns:
         by what follows the title of a plot: runs of one setting, or one sweep, which
@@ -161,7 +187,7 @@ def _groups(parts: Parts) -> dict[str, Parts]:
     """
     found = {
         f": {', '.join(run.label for run in own)}": Parts(runs=own)
-        for own in _settings(parts).values()
+        for own in _settings(parts, deployed).values()
     }
     found |= {f": {sweep.label}": Parts(sweeps=[sweep]) for sweep in parts.sweeps}
     return found if len(found) > 1 else dict.fromkeys([""], parts)
@@ -170,7 +196,7 @@ def _groups(parts: Parts) -> dict[str, Parts]:
 def _damage(scratch: Path, parts: Parts) -> dict[str, Path]:
     """Plot what attacks found against its cost, a plot for each group and route."""
     found = {}
-    for name, part in _groups(parts).items():
+    for name, part in _groups(parts, deployed=False).items():
         routes: dict[str, dict[str, plots.Curves]] = {}
         for route, method, curve in _curves(part):
             if curve is not None:
@@ -202,7 +228,7 @@ def _curves(parts: Parts) -> Iterator[tuple[str, str, Any]]:
 def _by_limit(scratch: Path, parts: Parts) -> dict[str, Path]:
     """Plot what attacks did against what their textures might change, by group."""
     found = {}
-    for name, part in _groups(parts).items():
+    for name, part in _groups(parts, deployed=True).items():
         for key, most in _LIMITS.items():
             points: dict[str, list[tuple[float, float]]] = {}
             for line, attack, error in _attacked(part):
@@ -218,15 +244,19 @@ def _by_limit(scratch: Path, parts: Parts) -> dict[str, Path]:
 
 
 def _attacked(parts: Parts) -> Iterator[tuple[str, Mapping[str, Any], float]]:
-    """Yield route and environment, section `attack` and mean error of every attack."""
+    """Yield line, section `attack` and mean error of every attack in an environment.
+
+    A line is of one route, environment and method; of a sweep, of one kind of objects.
+    """
     for run in parts.runs:
         section = run.document["scenario"]["attack"]
         for row in cells(run.document["routes"], "route", "environment"):
             if ATTACK in row:
+                line = f"{row['route']}, {row['environment']}"
                 error = row[ATTACK]["cross_track_mean_m"]
-                yield f"{row['route']}, {row['environment']}", section, error
+                yield f"{line}, {section['method']['kind']}", section, error
     for sweep in parts.sweeps:
         for row in sweep.attacks:
             if ATTACK in row["cases"] and row["section"] is not None:
-                line = f"{row['route']}, {row['environment']}"
-                yield line, row["section"], row["cases"][ATTACK]
+                words = (row[k] for k in ("route", "objects", "environment", "method"))
+                yield ", ".join(words), row["section"], row["cases"][ATTACK]

@@ -10,6 +10,7 @@ import numpy as np
 from mi_nerfattack.deploy.registry import kinematic_vehicle
 from mi_nerfattack.deploy.roadside.footprint import Shape
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.checks.standing import CAR_M
 from mi_nerfattack.experiment.retrain.among import attacked_objects, found_place
 from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.fields.grid import GridField
@@ -64,7 +65,8 @@ def drive_expert(found: FoundAttack) -> Driven:
     expert = expert_for(
         car.control_unit, route, place.period, car.max_control, car.wheelbase
     )
-    outlines = np.concatenate([_outline(item) for item in attacked_objects(found)])
+    objects = [item for item in attacked_objects(found) if _is_in_the_way(item)]
+    outlines = np.concatenate([np.zeros((0, 2)), *map(_outline, objects)])
     errors, gaps = [], []
     for pose in initial_states(scenario, route, scenario.drive.runs, 0):
         vehicle.reset(pose, route.speed_ms)
@@ -76,6 +78,13 @@ def drive_expert(found: FoundAttack) -> Driven:
         errors.append(np.abs(route.cross_track_numpy(path[1:])).max())
         gaps.append(_distance(path[:, :2], outlines) - car.width / 2)
     return Driven(float(max(errors)), found.lane.wheel_m, float(min(gaps)))
+
+
+def _is_in_the_way(posed: PosedField) -> bool:
+    """Whether a car cannot drive over an object."""
+    assert isinstance(posed.field, GridField)
+    top = posed.placed.apply(Shape.of(posed.field).upper[None])[0, 2]
+    return bool(top > CAR_M[0])
 
 
 def _outline(posed: PosedField) -> np.ndarray:
@@ -100,7 +109,8 @@ def _distance(path: np.ndarray, points: np.ndarray) -> float:
     square = np.maximum((along**2).sum(1), 1e-12)
     away = points[:, None] - begin
     share = np.clip((away * along).sum(2) / square, 0, 1)
-    return float(np.linalg.norm(away - share[..., None] * along, axis=2).min())
+    distances = np.linalg.norm(away - share[..., None] * along, axis=2)
+    return float(distances.min(initial=np.inf))
 
 
 def divide_solvable(

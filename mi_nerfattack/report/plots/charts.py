@@ -66,7 +66,7 @@ def save(path: str | Path, figure: Figure) -> None:
         InputError: the variable names another format.
     """
     files.write_bytes(path, png(figure))
-    for suffix in os.environ.get(VARIABLE, "").replace(",", " ").split():
+    for suffix in os.environ.get(VARIABLE, "").lower().replace(",", " ").split():
         if suffix not in _VECTOR:
             raise InputError(f"{VARIABLE}: {suffix!r}; must be pdf, svg, or both")
         buffer = io.BytesIO()

@@ -186,16 +186,42 @@ def test_objectives_stand_in_the_line_of_a_run(tmp_path, page_of):
 
 
 def test_files_of_a_scenario_count_by_their_checksums():
-    def run(label, digest, file):
+    def run(label, digest, file, **more_of_the_object):
         scenario = {"policy": {"file": file}, "name": label}
-        digests = {f"policy.file: {file}": digest}
+        scenario["objects"] = [
+            {"field": f"{label}/o.safetensors", **more_of_the_object}
+        ]
+        digests = {f"policy.file: {file}": digest, "objects[0].field: o": "o"}
         more = {"pictures": {}, "scrubbers": {}, "missing": {}, "repeat": ""}
         about = {"scenario": "", "made_with": {}, "digests": digests}
         return RunPart(label, {"scenario": scenario}, **about, **more)
 
     runs = [run("x", "1", "a.pt2"), run("y", "2", "a.pt2"), run("z", "1", "b.pt2")]
-    labels = [[r.label for r in own] for own in _settings(Parts(runs=runs)).values()]
-    assert labels == [["x", "z"], ["y"]]
+    assert grouped(runs) == [["x", "z"], ["y"]]
+    # Older runs do not say that an object is a file; its place counts
+    older, here, there = (
+        run("old", "1", "a.pt2"),
+        run("here", "1", "a.pt2", kind="field"),
+        run("there", "1", "a.pt2", kind="field", yaw_deg=9.0),
+    )
+    assert grouped([older, here, there]) == [["old", "here"], ["there"]]
+
+
+def grouped(runs, deployed=True):
+    found = _settings(Parts(runs=runs), deployed)
+    return [[run.label for run in own] for own in found.values()]
+
+
+def test_deployments_part_what_was_measured_in_them():
+    def run(label, kind):
+        scenario = {"name": label, "deployment": [{"kind": kind}]}
+        more = {"pictures": {}, "scrubbers": {}, "missing": {}, "repeat": ""}
+        about = {"scenario": "", "made_with": {}, "digests": {}}
+        return RunPart(label, {"scenario": scenario}, **about, **more)
+
+    runs = [run("a", "mitsuba"), run("b", "mujoco")]
+    assert grouped(runs) == [["a"], ["b"]]
+    assert grouped(runs, deployed=False) == [["a", "b"]]
 
 
 def test_transfers_and_retrainings_are_tables(tmp_path, page_of):

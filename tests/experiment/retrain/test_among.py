@@ -13,8 +13,10 @@ import pytest
 from support.worlds import attacks as attack_jobs
 from support.worlds.places import PaintedSite, small
 
+from mi_nerfattack.capture.mesh.flat import FlatObject
 from mi_nerfattack.deploy.sites import PlaceSite, Weather
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.retrain import solvable
 from mi_nerfattack.experiment.retrain.among import (
     AmongFound,
     attacked_objects,
@@ -25,6 +27,8 @@ from mi_nerfattack.experiment.retrain.solvable import drive_expert
 from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.fields import GridField, load_grid, save_field
 from mi_nerfattack.io import locks
+from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.rollout.drive import ATTACK
 from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.scenario.world import build_world, driven_route
@@ -178,6 +182,23 @@ def test_an_expert_drives_a_vehicle_whose_control_it_knows(found, tmp_path):
             driven.append(drive_expert(run))
     one, other = driven
     assert other.error_m == pytest.approx(one.error_m, abs=1e-6)
+
+
+def test_a_car_drives_over_what_is_low(found, monkeypatch):
+    run = found[0]
+    (standing, *_) = attacked_objects(run)
+    path = run.route.pose_at(run.route.length / 2)
+    for kind in ("patch", "billboard"):
+        field = FlatObject(kind, 1.0, 2.0).field()
+        pose = Pose.upright((path[0], path[1], 0.0), 0.0, 1.0)
+        objects = [standing, PosedField(field, pose)]
+        monkeypatch.setattr(solvable, "attacked_objects", lambda _, o=objects: o)
+        if kind == "patch":
+            low = drive_expert(run).gap_m
+        else:
+            assert drive_expert(run).gap_m < 0 < low
+    monkeypatch.setattr(solvable, "attacked_objects", lambda _: [])
+    assert drive_expert(run).gap_m == np.inf
 
 
 def test_a_second_process_is_refused_before_it_attacks_anew(tmp_path):
