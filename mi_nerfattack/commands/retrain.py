@@ -102,7 +102,7 @@ class Retrain:
         from mi_nerfattack.policy.pilotnet import PilotNet
         from mi_nerfattack.report.table import card_table, retrain_table
         from mi_nerfattack.system.workers import chosen_workers
-        from mi_nerfattack.training.collect import find_shards
+        from mi_nerfattack.training.dataset import find_shards
         from mi_nerfattack.training.imitate import imitate
         from mi_nerfattack.training.record import training_record, write_trained
 

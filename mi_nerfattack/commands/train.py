@@ -238,6 +238,6 @@ class Train:
         return replace(find_preset(self.preset), **given)
 
     def _more(self) -> list[Path]:
-        from mi_nerfattack.training.collect import find_shards
+        from mi_nerfattack.training.dataset import find_shards
 
         return [shard for folder in self.more for shard in find_shards(folder)]

@@ -21,8 +21,7 @@ from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, PilotNet
 from mi_nerfattack.report.pages.policy import training_facts
 from mi_nerfattack.system.workers import InThisProcess
 from mi_nerfattack.training import imitate as module
-from mi_nerfattack.training.collect import find_shards
-from mi_nerfattack.training.dataset import FrameDataset
+from mi_nerfattack.training.dataset import FrameDataset, find_shards
 from mi_nerfattack.training.imitate import Imitated, imitate
 from mi_nerfattack.training.presets import PRESETS, find_preset
 from mi_nerfattack.training.record import (
