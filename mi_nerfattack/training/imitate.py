@@ -12,7 +12,7 @@ import torch
 
 from mi_nerfattack.deploy.sites import AbstractSite
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.evaluation.evaluate import check_places
+from mi_nerfattack.evaluation.evaluate import EvaluateSettings, check_places
 from mi_nerfattack.io import files
 from mi_nerfattack.io.locks import exclusive, remove_partial
 from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, MOST_GOALS, PilotNet
@@ -82,7 +82,9 @@ def imitate(
             that do not fit, objects without a place, or another process that works in
             the folder; then, where the folder holds what was made with other settings.
     """
-    _check(sites, routes, settings, more)
+    _check_wanted(sites, routes, settings, more)
+    _check_policy(sites, routes, settings, more)
+    _check_places(sites, routes, settings, (settings.validation, settings.final))
     torch.manual_seed(settings.seed)
     car = sites[0].car
     goals = 1 + max(route.goal for route in routes)
@@ -98,6 +100,32 @@ def imitate(
         arguments = (settings, Path(folder), workers, progress, staging)
         run = _Imitation(sites, routes, *arguments)
         return run.run(module, more)
+
+
+def collect_frames(
+    sites: Sequence[AbstractSite],
+    routes: Sequence[Route],
+    settings: ImitationSettings,
+    folder: str | Path,
+    workers: AbstractWorkers,
+    progress: OnStage = lambda stage, done, total, state: None,
+    staging: AbstractStaging = ROADSIDE,
+) -> list[Path]:
+    """Collect the frames of the first training and the held-out ones; train nothing.
+
+    Images may have any size. If they have PilotNet's, `imitate` with the same arguments
+    trains on these frames. Arguments and errors are those of `imitate`.
+
+    Returns:
+        The shards, in order.
+    """
+    _check_wanted(sites, routes, settings, ())
+    _check_places(sites, routes, settings, ())
+    with exclusive(files.make_folder(folder)):
+        remove_partial(folder)  # of killed writers
+        arguments = (settings, Path(folder), workers, progress, staging)
+        run = _Imitation(sites, routes, *arguments)
+        return [*run.collect_first(), *run.collect_held_out()]
 
 
 @dataclass(eq=False)
@@ -118,12 +146,8 @@ class _Imitation:
     def run(self, module: PilotNet, more: Sequence[Path]) -> Imitated:
         """Do all stages, beginning with the weights of `module`."""
         settings = self.settings
-        self.take(
-            [*more, *self.collect("round_0", settings.frames, settings.cloning, 0)]
-        )
-        self.held_out += self.collect(
-            "held_out", settings.validation_frames, settings.cloning, _HELD_OUT
-        )
+        self.take([*more, *self.collect_first()])
+        self.held_out += self.collect_held_out()
         with self:
             history = [self.train(module, 0)]
             weights = [self.save(module, 0)]
@@ -171,6 +195,16 @@ class _Imitation:
     def _validated(self) -> list[AbstractSite]:
         chosen = self.settings.validate_in
         return [site for site in self.sites if not chosen or site.name in chosen]
+
+    def collect_first(self) -> list[Path]:
+        """Collect the frames of the first training."""
+        settings = self.settings
+        return self.collect("round_0", settings.frames, settings.cloning, 0)
+
+    def collect_held_out(self) -> list[Path]:
+        """Collect the frames of the held-out loss, where they have a collection."""
+        wanted, source = self.settings.validation_frames, self.settings.cloning
+        return self.collect("held_out", wanted, source, _HELD_OUT)
 
     def collect(
         self, name: str, frames: Mapping[str, int], source: AbstractSource, number: int
@@ -256,7 +290,7 @@ class _Imitation:
         )
 
 
-def _check(
+def _check_wanted(
     sites: Sequence[AbstractSite],
     routes: Sequence[Route],
     settings: ImitationSettings,
@@ -271,6 +305,16 @@ def _check(
             f"imitate: {frames} frames of {names}, {len(routes)} routes; at least one "
             "frame and one route"
         )
+
+
+def _check_policy(
+    sites: Sequence[AbstractSite],
+    routes: Sequence[Route],
+    settings: ImitationSettings,
+    more: Sequence[Path],
+) -> None:
+    """Raise `InputError` for what PilotNet cannot be trained on."""
+    frames = sum(settings.frames.values())
     for route in routes:
         if route.goal >= MOST_GOALS:
             raise InputError(
@@ -286,32 +330,32 @@ def _check(
             f"frames: {frames}, one shard of up to {size}; at least two, of which one "
             "is held out, or give validation_frames"
         )
-    _check_objects(sites[0], routes, settings)
-    # what cannot be made is told now, not after the hours of those before it
-    for site in sites:
-        site.open(site.typical()).close()
 
 
-def _check_objects(
-    site: AbstractSite, routes: Sequence[Route], settings: ImitationSettings
+def _check_places(
+    sites: Sequence[AbstractSite],
+    routes: Sequence[Route],
+    settings: ImitationSettings,
+    measured: Sequence[EvaluateSettings],
 ) -> None:
-    """Raise `InputError` for objects that find no place."""
-    measured = (settings.validation, settings.final)
+    """Raise `InputError` for objects without a place, or a site that does not open."""
     for drives in measured:
         departure_limits(routes, drives.car_width_m)
     collecting = settings.collecting
     wanted = collecting.objects if collecting.object_share else 0
-    most = max(wanted, *(drives.most for drives in measured))
-    objects = site.load_objects(most) if most else []
-    if not objects:
-        return
-    surroundings = site.load_surroundings()
-    for drives in measured:
-        check_places(site.period, routes, objects, surroundings, drives)
-    if wanted:  # near the ends of a route there may be none; somewhere there must
+    most = max([wanted, *(drives.most for drives in measured)])
+    objects = sites[0].load_objects(most) if most else []
+    if objects:
+        surroundings = sites[0].load_surroundings()
+        for drives in measured:
+            check_places(sites[0].period, routes, objects, surroundings, drives)
+        # near the ends of a route there may be no place; somewhere there must
         rng, rule = np.random.default_rng(settings.seed), collecting.roadside
-        for route in routes:
+        for route in routes if wanted else ():
             rule.draw(objects[:1], surroundings, route, (0.0, route.length), rng)
+    # what cannot be made is told now, not after the hours of those before it
+    for site in sites:
+        site.open(site.typical()).close()
 
 
 def check_camera(site: AbstractSite) -> None:
@@ -321,7 +365,8 @@ def check_camera(site: AbstractSite) -> None:
     if (camera.width, camera.height) != (width, height):
         raise InputError(
             f"camera of {site.name!r}: {camera.width} x {camera.height} px; PilotNet "
-            f"takes {width} x {height}"
+            f"takes {width} x {height}: change the camera, or collect frames alone "
+            "('mi-nerfattack train --frames-only') and train your own network"
         )
 
 
