@@ -38,25 +38,23 @@ class Train:
     Collects frames (three quarters with 1 to 6 objects of random texture beside the
     road), trains PilotNet to imitate the expert, lets it drive and trains it on what it
     saw (DAgger), and ends with its closed-loop error. Stopped, it continues from DATA.
-    The validation is written beside the policy, as JSON, and so is the policy as a
-    program of torch.export.
+    Validation and program of the policy are written beside it.
     """
 
     continues: ClassVar[bool] = True
 
     data: Path
-    """Folder of frames and checkpoints; made if missing."""
+    """Folder of frames and checkpoints."""
     output: Path | None = None
     """Policy file to write (.safetensors)."""
     frames_only: bool = False
-    """Collect the first frames and those of --validation-frames; train no policy."""
+    """Collect frames and train no policy."""
     like: str | None = None
-    """TOML file of evaluate: camera and vehicle of the frames. A scenario also gives
-    scene, routes and objects unless options name others."""
+    """TOML file of evaluate: its camera and vehicle."""
     settings: Settings = ()
-    """Set a key of the --like file: vehicle.trust_code=true."""
+    """Set a key of that file: vehicle.trust_code=true."""
     preset: str = "laptop"
-    """Sizes of all that is not given: laptop, intersection or room."""
+    """Sizes: laptop, intersection or room."""
     scene: Path | None = None
     """Mitsuba scene (.xml); needs --routes-file."""
     field: Path | None = None
@@ -86,7 +84,7 @@ class Train:
     learning_rate: float = 1e-3
     """Largest learning rate."""
     dagger_rounds: int | None = None
-    """Rounds in which the policy drives and the expert labels."""
+    """Rounds in which the policy itself drives."""
     dagger_frames: dict[str, int] | None = None
     """Frames of each round."""
     dagger_epochs: int | None = None
@@ -110,7 +108,7 @@ class Train:
     seed: int = 0
     """Seed of all random numbers."""
     json: bool = False
-    """End with one line of JSON: the policy's record, or numbers of frames."""
+    """End with one line of JSON, the policy's record."""
 
     def run(self) -> Result:
         """Collect, train, validate and write."""

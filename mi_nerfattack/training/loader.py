@@ -55,7 +55,7 @@ class Frame(NamedTuple):
 class Frames(torch.utils.data.Dataset[Frame]):
     """Frames of shards as PyTorch takes them; images stay on the disk.
 
-    All other columns are kept in memory, about 120 bytes per frame.
+    All other columns are kept in memory, about 100 bytes per frame.
 
     Args:
         shards: files of `collect`; their order is that of the frames.
