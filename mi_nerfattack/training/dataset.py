@@ -7,6 +7,7 @@ Frames stay on the disk.
 
 from __future__ import annotations
 
+import json
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -235,6 +236,12 @@ def find_shards(folder: str | Path) -> list[Path]:
             f"{folder}: no frames in it; give a folder of 'mi-nerfattack train'"
         )
     return found
+
+
+def control_unit_of(shard: Path) -> str | None:
+    """Return the unit of a shard's controls; None where its site does not say it."""
+    _, metadata = files.read_safetensors(shard, ())
+    return json.loads(metadata.get("site.car.control_unit", "null"))
 
 
 def divide_shards(

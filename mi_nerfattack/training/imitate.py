@@ -19,7 +19,11 @@ from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, MOST_GOALS, PilotNet
 from mi_nerfattack.rollout.drive import departure_limits
 from mi_nerfattack.system.workers import AbstractWorkers
 from mi_nerfattack.training.collect import OnFrames, collect
-from mi_nerfattack.training.dataset import FrameDataset, divide_shards
+from mi_nerfattack.training.dataset import (
+    FrameDataset,
+    control_unit_of,
+    divide_shards,
+)
 from mi_nerfattack.training.settings import ImitationSettings
 from mi_nerfattack.training.sources import AbstractSource, PolicyDrives
 from mi_nerfattack.training.staging import ROADSIDE, AbstractStaging
@@ -111,13 +115,10 @@ def collect_frames(
     progress: OnStage = lambda stage, done, total, state: None,
     staging: AbstractStaging = ROADSIDE,
 ) -> list[Path]:
-    """Collect the frames of the first training and the held-out ones; train nothing.
+    """Collect the frames of the first training; return all shards, train nothing.
 
     Images may have any size. If they have PilotNet's, `imitate` with the same arguments
     trains on these frames. Arguments and errors are those of `imitate`.
-
-    Returns:
-        The shards, in order.
     """
     _check_wanted(sites, routes, settings, ())
     _check_places(sites, routes, settings, ())
@@ -125,7 +126,8 @@ def collect_frames(
         remove_partial(folder)  # of killed writers
         arguments = (settings, Path(folder), workers, progress, staging)
         run = _Imitation(sites, routes, *arguments)
-        return [*run.collect_first(), *run.collect_held_out()]
+        first, held_out = run.collect_first()
+        return [*first, *held_out]
 
 
 @dataclass(eq=False)
@@ -146,8 +148,9 @@ class _Imitation:
     def run(self, module: PilotNet, more: Sequence[Path]) -> Imitated:
         """Do all stages, beginning with the weights of `module`."""
         settings = self.settings
-        self.take([*more, *self.collect_first()])
-        self.held_out += self.collect_held_out()
+        first, held_out = self.collect_first()
+        self.take([*more, *first])
+        self.held_out += held_out
         with self:
             history = [self.train(module, 0)]
             weights = [self.save(module, 0)]
@@ -196,15 +199,12 @@ class _Imitation:
         chosen = self.settings.validate_in
         return [site for site in self.sites if not chosen or site.name in chosen]
 
-    def collect_first(self) -> list[Path]:
-        """Collect the frames of the first training."""
-        settings = self.settings
-        return self.collect("round_0", settings.frames, settings.cloning, 0)
-
-    def collect_held_out(self) -> list[Path]:
-        """Collect the frames of the held-out loss, where they have a collection."""
-        wanted, source = self.settings.validation_frames, self.settings.cloning
-        return self.collect("held_out", wanted, source, _HELD_OUT)
+    def collect_first(self) -> tuple[list[Path], list[Path]]:
+        """Collect the frames of the first training, and the held-out ones, if any."""
+        settings, source = self.settings, self.settings.cloning
+        first = self.collect("round_0", settings.frames, source, 0)
+        wanted = settings.validation_frames
+        return first, self.collect("held_out", wanted, source, _HELD_OUT)
 
     def collect(
         self, name: str, frames: Mapping[str, int], source: AbstractSource, number: int
@@ -379,6 +379,10 @@ def _check_frames(module: PilotNet, shards: Sequence[Path]) -> None:
                 f"{shard}: frames of {width} x {height} px; PilotNet takes "
                 f"{IMAGE_SHAPE[1]} x {IMAGE_SHAPE[0]}"
             )
+        unit = control_unit_of(shard)
+        if unit not in (None, module.unit):
+            need = f"the policy's are in {module.unit}: leave these frames out"
+            raise InputError(f"{shard}: controls in {unit}; {need}")
         try:
             check_labels(module, data)
         except InputError as error:

@@ -17,6 +17,7 @@ from mi_nerfattack.training.dataset import (
     FORMAT,
     FrameDataset,
     FrameStates,
+    control_unit_of,
     find_shards,
 )
 
@@ -64,18 +65,20 @@ class Frames(torch.utils.data.Dataset[Frame]):
 
     Attributes:
         waypoints_s: k times ahead of the waypoints, seconds.
+        control_unit: "rad/s" or "rad"; None where a site of yours does not say it.
         routes: names of the routes.
 
     Raises:
         InputError: no shard, a window below 1, or a shard that is damaged, of an
-            earlier version, or of other waypoints or another size than the first.
+            earlier version, or of other times, another unit or another size than the
+            first.
     """
 
     def __init__(self, shards: Sequence[Path], window: int = 1) -> None:
         if window < 1:
             raise InputError(f"window: {window}; at least 1 frame")
         columns: list[dict[str, np.ndarray]] = []
-        times: dict[tuple[float, ...], Path] = {}
+        kinds: dict[tuple[str, str | None], Path] = {}
         names: list[str] = []
         drives = 0
         for path in shards:
@@ -86,12 +89,14 @@ class Frames(torch.utils.data.Dataset[Frame]):
             numbered = states["drives"] + drives
             columns.append(states | {"drives": numbered, "routes": routes})
             drives = int(numbered[-1]) + 1
-            times.setdefault(tuple(json.loads(metadata["settings.waypoints_s"])), path)
-        if len(times) > 1:
-            found = ", ".join(f"{list(key)} s in {path}" for key, path in times.items())
-            raise InputError(
-                f"waypoints: {found}; give a folder whose frames have the same"
+            kind = metadata["settings.waypoints_s"], control_unit_of(path)
+            kinds.setdefault(kind, path)
+        if len(kinds) > 1:
+            found = "; ".join(
+                f"{path}: waypoints after {times} s, controls in {unit}"
+                for (times, unit), path in kinds.items()
             )
+            raise InputError(f"{found}: give a folder whose frames have the same")
         self._data = FrameDataset.from_shards(shards)
         self._columns = {
             name: np.concatenate([column[name] for column in columns])
@@ -99,7 +104,8 @@ class Frames(torch.utils.data.Dataset[Frame]):
         }
         self._columns |= {"goals": self._data.goals, "controls": self._data.controls}
         self.window: int = window
-        (self.waypoints_s,) = times
+        ((times, self.control_unit),) = kinds
+        self.waypoints_s: tuple[float, ...] = tuple(json.loads(times))
         self.routes: tuple[str, ...] = tuple(names)
 
     def __len__(self) -> int:

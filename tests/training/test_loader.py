@@ -214,9 +214,29 @@ def of_two_kinds(folder: Path) -> None:
     nf.frames(folder)
 
 
+@dataclasses.dataclass(frozen=True)
+class UnitSite(PaintedSite):
+    """Says in which unit its labels are."""
+
+    unit: str = "rad"
+
+    def describe(self):
+        return super().describe() | {"car": {"control_unit": self.unit}}
+
+
+def of_two_units(folder: Path) -> None:
+    for unit in ("rad/s", "rad"):
+        name = unit.replace("/", "")
+        site = UnitSite(objects=False, unit=unit)
+        gather(folder / name, Scattered(), site=site, frames=12)
+        assert nf.frames(folder / name).control_unit == unit
+    nf.frames(folder)
+
+
 test_what_is_refused = refusals(
     (of_earlier_version, "frames 1'.* collect again, into another folder"),
-    (of_two_kinds, r"waypoints: \[0.5, .*shard_0000.*, \[1.0\] s in .*b.painted"),
+    (of_two_kinds, r"a.painted.* \[0.5, .*; .*b.painted.* after \[1.0\] s"),
+    (of_two_units, "controls in rad; .*controls in rad/s: give a folder"),
     (lambda folder: nf.frames(folder), "no frames"),
     (lambda: Frames([Path("any")], window=0), "window: 0; at least 1"),
     (lambda: CollectSettings(waypoints_s=()), "waypoints_s: .*; at least one"),
