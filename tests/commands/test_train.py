@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import pickle
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from support.worlds.places import write_place
 
 import mi_nerfattack as nf
 from mi_nerfattack import cli
+from mi_nerfattack.commands.retrain import Retrain
 from mi_nerfattack.commands.train import Train
 from mi_nerfattack.deploy.place import bundled_place
 from mi_nerfattack.experiment.retrain.solvable import drive_expert
@@ -141,6 +144,27 @@ def check_table(about: dict, folder: Path, *more: str) -> None:
         assert before["cross_track_mean_m"] != after["cross_track_mean_m"]
         ratio = after["cross_track_mean_m"] / before["cross_track_mean_m"]
         assert row["clean_ratio"] == pytest.approx(ratio)
+
+
+def test_workers_make_the_vehicle_of_a_runs_user(run, tmp_path, monkeypatch):
+    """A process that never loaded the user's file opens the place."""
+    vehicle = f"[vehicle]\n{CUSTOM}trust_code = true\n".replace('"rad"', '"rad/s"')
+    custom = changed(run, tmp_path / "custom", ("[drive]", f"{vehicle}[drive]"))
+    (custom / "car.py").write_text(CAR)
+    (found,) = read_found([custom])
+    command = Retrain((custom,), tmp_path / "o", tmp_path / "d", exposures_ev=(0.0,))
+    place = command._place([found])
+    settings = command._settings(Path(found.scenario.policy.file.file), place)
+    sent = pickle.dumps(command._sites(place, settings, found.scenario.vehicle))
+    for name in [name for name in sys.modules if name.startswith("mi_nerfattack_user")]:
+        monkeypatch.delitem(sys.modules, name)
+    for site in pickle.loads(sent):
+        environment = site.open(site.typical())
+        environment.reset(found.route)
+        environment.step(0.0)
+        moved = np.hypot(*(environment.state[:2] - found.route.points[0]))
+        assert moved == pytest.approx(0.6, rel=1e-3)  # 6 m/s, as only its file says
+        environment.close()
 
 
 def test_the_expert_decides_what_can_be_driven(run, tmp_path):
