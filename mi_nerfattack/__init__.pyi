@@ -48,6 +48,7 @@ from .scenario import build_world as build_world
 from .scenario import load_policy as load_policy
 from .scenario import load_scenario as load_scenario
 from .scenes import bundled as bundled  # pyright: ignore[reportMissingImports]
+from .training import frames as frames
 from .vehicle import RK4 as RK4
 from .vehicle import Ackermann as Ackermann
 from .vehicle import Dubins as Dubins

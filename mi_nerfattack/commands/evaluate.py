@@ -149,7 +149,7 @@ class Evaluate:
         is_chosen = self.where != PlaceOptions()
         section, under = file.section, self._environments()
         place = file.place(self.where.build(), is_chosen)
-        self._check_wheels(file)
+        file.check_wheels("--environments", self.environments)
         own = file.scenario is not None and not is_chosen
         routes, settings = self._routes(place.routes, file), self._settings(place, own)
         if file.vehicle is not None:
@@ -217,16 +217,6 @@ class Evaluate:
             return tuple(town_routes(path, session.town_map, api, self.routes))
         finally:
             session.close()
-
-    def _check_wheels(self, file: PolicyFile) -> None:
-        from mi_nerfattack.scenario.vehicle import CustomSection
-
-        wheels = [name for name in self.environments if name.startswith("mujoco")]
-        if wheels and isinstance(file.vehicle, CustomSection):
-            raise InputError(
-                f"--environments: {wheels[0]} drives a car with wheels, whose control "
-                "is not that of a custom vehicle; leave it out"
-            )
 
     def _environments(self) -> tuple[EnvironmentUnder, ...]:
         from mi_nerfattack.deploy.registry import ENVIRONMENTS

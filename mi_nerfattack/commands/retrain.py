@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from mi_nerfattack.deploy.sites import PlaceSite
     from mi_nerfattack.experiment.retrain.compare import Comparison
     from mi_nerfattack.experiment.transfer.found import FoundAttack
+    from mi_nerfattack.scenario.vehicle import AbstractVehicleSection
     from mi_nerfattack.system.workers import AbstractWorkers
     from mi_nerfattack.training.settings import ImitationSettings
 
@@ -102,7 +103,7 @@ class Retrain:
         from mi_nerfattack.policy.pilotnet import PilotNet
         from mi_nerfattack.report.table import card_table, retrain_table
         from mi_nerfattack.system.workers import chosen_workers
-        from mi_nerfattack.training.collect import find_shards
+        from mi_nerfattack.training.dataset import find_shards
         from mi_nerfattack.training.imitate import imitate
         from mi_nerfattack.training.record import training_record, write_trained
 
@@ -114,7 +115,8 @@ class Retrain:
         more = [shard for folder in self.more for shard in find_shards(folder)]
         groups, others = self._groups(attacks)
         settings = self._settings(policy, place)
-        sites, old = self._sites(place, settings), groups[OLD]
+        vehicle, old = attacks[0].scenario.vehicle, groups[OLD]
+        sites = self._sites(place, settings, vehicle)
         routes = list({found.route.name: found.route for found in old}.values())
         names, workers = self.environments, chosen_workers(self.workers, False)
         drives = Comparison(groups, names, self.runs, self.spp, self.data)
@@ -181,11 +183,19 @@ class Retrain:
 
         return found_place(attacks[: len(self.run_folders)])
 
-    def _sites(self, place: Place, settings: ImitationSettings) -> list[PlaceSite]:
+    def _sites(
+        self, place: Place, settings: ImitationSettings, vehicle: AbstractVehicleSection
+    ) -> list[PlaceSite]:
+        from dataclasses import replace
+
         from mi_nerfattack.deploy.sites import PlaceSite, Weather
 
         weather = Weather(self.skies, self.exposures_ev, self.spp)
-        return [PlaceSite(name, place, weather) for name in settings.sites]
+        place = replace(place, motion=None)  # each process makes its own
+        return [
+            PlaceSite(name, place, weather, motion=vehicle.motion)
+            for name in settings.sites
+        ]
 
     def _check_apart(self, policy: Path) -> None:
         if self.output.resolve() == policy.resolve():

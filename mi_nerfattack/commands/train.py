@@ -11,7 +11,8 @@ from mi_nerfattack.commands.shared.evaluate_options import (
     PlaceOptions,
     parse_scales,
 )
-from mi_nerfattack.commands.shared.options import command_line
+from mi_nerfattack.commands.shared.options import Settings, command_line
+from mi_nerfattack.commands.shared.policy_file import PolicyFile
 from mi_nerfattack.commands.shared.terminal import Result, console
 from mi_nerfattack.errors import InputError
 
@@ -37,18 +38,23 @@ class Train:
     Collects frames (three quarters with 1 to 6 objects of random texture beside the
     road), trains PilotNet to imitate the expert, lets it drive and trains it on what it
     saw (DAgger), and ends with its closed-loop error. Stopped, it continues from DATA.
-    The validation is written beside the policy, as JSON, and so is the policy as a
-    program of torch.export.
+    Validation and program of the policy are written beside it.
     """
 
     continues: ClassVar[bool] = True
 
-    output: Path
-    """Policy file to write (.safetensors)."""
     data: Path
-    """Folder of frames and checkpoints; made if missing."""
+    """Folder of frames and checkpoints."""
+    output: Path | None = None
+    """Policy file to write (.safetensors)."""
+    frames_only: bool = False
+    """Collect frames and train no policy."""
+    like: str | None = None
+    """TOML file of evaluate: its camera and vehicle."""
+    settings: Settings = ()
+    """Set a key of that file: vehicle.trust_code=true."""
     preset: str = "laptop"
-    """Sizes of all that is not given: laptop, intersection or room."""
+    """Sizes: laptop, intersection or room."""
     scene: Path | None = None
     """Mitsuba scene (.xml); needs --routes-file."""
     field: Path | None = None
@@ -78,7 +84,7 @@ class Train:
     learning_rate: float = 1e-3
     """Largest learning rate."""
     dagger_rounds: int | None = None
-    """Rounds in which the policy drives and the expert labels."""
+    """Rounds in which the policy itself drives."""
     dagger_frames: dict[str, int] | None = None
     """Frames of each round."""
     dagger_epochs: int | None = None
@@ -90,7 +96,7 @@ class Train:
     runs: int = 2
     """Drives per case of the last validation."""
     most_objects: int | None = None
-    """Most objects beside the road in a frame."""
+    """Most objects beside the road in a frame; 0: none."""
     scale: tuple[float, ...] = ()
     """Least and most factor to the size, as of evaluate."""
     facing: Facing = "shape"
@@ -107,51 +113,78 @@ class Train:
     def run(self) -> Result:
         """Collect, train, validate and write."""
         from mi_nerfattack import variant
-        from mi_nerfattack.commands.shared.fit_report import check_output
         from mi_nerfattack.commands.shared.progress import StageBars
-        from mi_nerfattack.io import files
-        from mi_nerfattack.policy.exported import SUFFIX
         from mi_nerfattack.policy.pilotnet import PilotNet
         from mi_nerfattack.report.table import card_table
         from mi_nerfattack.system.workers import Processes, available_cores
-        from mi_nerfattack.training.imitate import imitate
-        from mi_nerfattack.training.record import training_record, write_trained
-        from mi_nerfattack.vehicle.route.route import load_routes
+        from mi_nerfattack.training.imitate import collect_frames, imitate
+        from mi_nerfattack.training.record import (
+            count_frames,
+            training_record,
+            write_trained,
+        )
 
-        check_output(self.output)
-        for suffix in (SUFFIX, ".json"):
-            files.check_writable(self.output.with_suffix(suffix))
+        output = self._checked_output()
         variant.ensure()
-        preset = self._preset()
-        place, settings = self._place(preset), self._settings(preset)
-        routes = load_routes(place.routes)
+        preset, file = self._preset(), self._file()
+        place = self._place(preset, file)
+        settings, routes = self._settings(preset, place), self._routes(place, file)
+        sites = self._sites(preset, place, settings, file)
+        workers = Processes(available_cores() if self.workers is None else self.workers)
+        if output is None:
+            with StageBars() as bars:
+                shards = collect_frames(
+                    sites, routes, settings, self.data, workers, bars.show
+                )
+            counts = count_frames(self.data, shards)
+            lines = [f"{self.data / name}: {n} frames" for name, n in counts.items()]
+            return Result({"data": counts}, lambda: print("\n".join(lines)))
         start = None if self.start is None else PilotNet.load(self.start)
-        sites, more = self._sites(preset, place, settings), self._more()
+        more = self._more()
         with StageBars() as bars:
             result = imitate(
-                sites,
-                routes,
-                settings,
-                self.data,
-                Processes(available_cores() if self.workers is None else self.workers),
-                bars.show,
-                start,
-                more,
+                sites, routes, settings, self.data, workers, bars.show, start, more
             )
         command = command_line("train", self)
         record = training_record(settings, sites, self.data, result, command)
-        document = write_trained(self.output, result.module, record)
-        picture = self.output.with_name(f"{self.output.stem}-place.png")
-        self._draw(picture, place, routes)
+        document = write_trained(output, result.module, record)
+        picture = output.with_name(f"{output.stem}-place.png")
+        title = f"{output.name}: where it was trained"
+        self._draw(picture, title, place, routes)
 
         def show() -> None:
             console().print(card_table(result.card))
-            print(f"{self.output}: written; program and validation are beside it")
+            print(f"{output}: written; program and validation are beside it")
             print(f"{picture}: where it was trained, from above")
 
         return Result(document, show)
 
-    def _draw(self, picture: Path, place: Place, routes: list[Route]) -> None:
+    def _checked_output(self) -> Path | None:
+        """Return the policy's file, which can be written; None for frames only."""
+        from mi_nerfattack.commands.shared.fit_report import check_output
+        from mi_nerfattack.io import files
+        from mi_nerfattack.policy.exported import SUFFIX
+
+        if self.frames_only:
+            for name in ("output", "start", "more"):
+                if getattr(self, name):
+                    raise InputError(
+                        f"--{name}: has no effect with --frames-only, which trains no "
+                        "policy; leave one of both out"
+                    )
+            return None
+        if self.output is None:
+            raise InputError(
+                "-o: is missing; name the policy's file, or give --frames-only"
+            )
+        check_output(self.output)
+        for suffix in (SUFFIX, ".json"):
+            files.check_writable(self.output.with_suffix(suffix))
+        return self.output
+
+    def _draw(
+        self, picture: Path, title: str, place: Place, routes: list[Route]
+    ) -> None:
         from mi_nerfattack.deploy.surrogate.scene import field_sensor
         from mi_nerfattack.fields import load_field
         from mi_nerfattack.render.posed import PosedField
@@ -159,51 +192,101 @@ class Train:
 
         look, sensor = (place.camera, place.mount), None
         if place.field is not None:
-            sensor = field_sensor(PosedField(load_field(place.field)), [], *look)
-        title = f"{self.output.name}: where it was trained"
+            field = PosedField(load_field(place.field), place.field_pose)
+            sensor = field_sensor(field, [], *look)
         routes_picture(picture, place.scene, routes, *look, sensor, title)
 
-    def _place(self, preset: Preset) -> Place:
+    def _file(self) -> PolicyFile:
+        """Read the file of --like; an empty one where there is none."""
+        if self.like is None:
+            if self.settings:
+                raise InputError("--set: sets a key of --like, which is missing")
+            return PolicyFile("--like")
+        file = PolicyFile.read(self.like, self.settings)
+        if file.camera is None and file.vehicle is None:
+            raise InputError(
+                f"--like: {self.like}; has neither [camera] nor [vehicle]: add one, or "
+                "leave the option out"
+            )
+        if file.vehicle is not None and not file.vehicle.has_expert:
+            raise InputError(
+                f"{self.like}: vehicle.control_unit: is missing; the expert that "
+                "labels frames needs 'rad/s' or 'rad'"
+            )
+        return file
+
+    def _place(self, preset: Preset, file: PolicyFile) -> Place:
         from mi_nerfattack.deploy.place import bundled_place
 
-        objects = self.object or bundled_place(preset.place).objects
-        return PlaceOptions(
+        options = self.scene, self.field, self.routes_file, self.object
+        place = PlaceOptions(
             place=preset.place,
             scene=self.scene,
             field=self.field,
             routes_file=self.routes_file,
-            object=objects,
+            object=self.object or bundled_place(preset.place).objects,
         ).build()
+        return file.place(place, is_chosen=any(options))
+
+    def _routes(self, place: Place, file: PolicyFile) -> list[Route]:
+        from mi_nerfattack.scenario.world import at_own_speed
+        from mi_nerfattack.vehicle.route.route import load_routes
+
+        routes = load_routes(place.routes)
+        if file.vehicle is None:
+            return routes
+        motion = file.vehicle.motion()
+        return [at_own_speed(route, motion) for route in routes]
 
     def _sites(
-        self, preset: Preset, place: Place, settings: ImitationSettings
+        self,
+        preset: Preset,
+        place: Place,
+        settings: ImitationSettings,
+        file: PolicyFile,
     ) -> list[AbstractSite]:
+        from mi_nerfattack.deploy.place import bundled_place
         from mi_nerfattack.deploy.sites import PlaceSite, Weather
+        from mi_nerfattack.scenario.named_file import section_content
 
         # a scene without a sunsky emitter has no times of day
-        skies = preset.weather.skies if self.scene is None else ("day",)
+        is_bundled = place.scene == bundled_place(preset.place).scene
         weather = Weather(
-            self.skies or skies,
+            self.skies or (preset.weather.skies if is_bundled else ("day",)),
             self.exposures_ev or preset.weather.exposures_ev,
             self.spp,
         )
         for name in settings.sites:
             if name in _REFUSED:
                 raise InputError(f"environment: {name!r}; {_REFUSED[name]}")
-        return [PlaceSite(name, place, weather) for name in settings.sites]
+        file.check_wheels("--frames", settings.sites)
+        vehicle = file.vehicle
+        return [
+            PlaceSite(
+                name,
+                place,
+                weather,
+                motion=None if vehicle is None else vehicle.motion,
+                vehicle=None if vehicle is None else section_content(vehicle),
+            )
+            for name in settings.sites
+        ]
 
-    def _settings(self, preset: Preset) -> ImitationSettings:
+    def _settings(self, preset: Preset, place: Place) -> ImitationSettings:
         from dataclasses import replace
 
-        from mi_nerfattack.training.presets import EVALUATIONS
+        from mi_nerfattack.training.presets import evaluation_for
         from mi_nerfattack.training.settings import ImitationSettings
         from mi_nerfattack.training.train import TrainSettings
 
-        count = len(self._place(preset).objects)
-        collecting, drives = preset.collecting, EVALUATIONS[preset.place]
+        collecting, width = preset.collecting, place.car.width
+        drives = replace(evaluation_for(width), car_width_m=width)
+        count = len(place.objects)
         scales = parse_scales(self.scale, count) or collecting.roadside.scales
         roadside = replace(collecting.roadside, scales=scales, facing=self.facing)
-        most = collecting.objects if self.most_objects is None else self.most_objects
+        if self.most_objects == 0:
+            collecting = replace(collecting, object_share=0.0)
+        most = self.most_objects or collecting.objects
         drives = replace(
             drives, runs=self.runs, objects=self.objects, roadside=roadside
         )
@@ -215,7 +298,7 @@ class Train:
             dagger_epochs=preset.dagger_epochs,
             seed=self.seed,
             validate_every=self.validate_every,
-            validate_in=self.validate_in,
+            validate_in=() if self.frames_only else self.validate_in,
             collecting=replace(collecting, objects=most, roadside=roadside),
             training=TrainSettings(
                 preset.epochs, self.batch, learning_rate=self.learning_rate
@@ -235,9 +318,11 @@ class Train:
         )
         given = {name: getattr(self, name) for name in names.split()}
         given = {name: value for name, value in given.items() if value is not None}
+        if self.frames_only:
+            given["dagger_rounds"] = 0
         return replace(find_preset(self.preset), **given)
 
     def _more(self) -> list[Path]:
-        from mi_nerfattack.training.collect import find_shards
+        from mi_nerfattack.training.dataset import find_shards
 
         return [shard for folder in self.more for shard in find_shards(folder)]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from mi_nerfattack.deploy.registry import (
     make_environment,
 )
 from mi_nerfattack.deploy.roadside.surroundings import Surroundings
+from mi_nerfattack.deploy.vehicle import Motion
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.io import load_grid
@@ -130,11 +131,16 @@ class PlaceSite(AbstractSite):
         name: key of `deploy.registry.ENVIRONMENTS`.
         place: files, camera, car.
         weather: conditions of the shards.
+        motion: makes the place's motion where an environment is opened: no process can
+            send a user's vehicle.
+        vehicle: what decides about it, as JSON.
     """
 
     name: str
     place: Place
     weather: Weather = field(default_factory=Weather)
+    motion: Callable[[], Motion] | None = None
+    vehicle: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         if self.name not in ENVIRONMENTS:
@@ -174,7 +180,10 @@ class PlaceSite(AbstractSite):
 
     def open(self, conditions: Conditions) -> AbstractEnvironment:
         """Make the environment by its name."""
-        return make_environment(self.name, self.place, conditions)
+        place = self.place
+        if self.motion is not None:
+            place = replace(place, motion=self.motion())
+        return make_environment(self.name, place, conditions)
 
     def load_objects(self, least: int = 1) -> list[GridField]:
         """Load the place's objects, in turns."""
@@ -207,6 +216,7 @@ class PlaceSite(AbstractSite):
             "car": asdict(place.car),
             "period": place.period,
             "weather": asdict(self.weather),
+            **({} if self.vehicle is None else {"vehicle": dict(self.vehicle)}),
             **_engine(self.name, place),
             **_posed(place),
         }

@@ -1,5 +1,8 @@
-from .collect import find_shards as find_shards
 from .dataset import FrameDataset as FrameDataset
+from .dataset import find_shards as find_shards
+from .loader import Frame as Frame
+from .loader import Frames as Frames
+from .loader import frames as frames
 from .settings import CollectSettings as CollectSettings
 from .settings import ImitationSettings as ImitationSettings
 from .sources import AbstractSource as AbstractSource

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,6 @@ import numpy as np
 from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.deploy.environment import AbstractEnvironment, OpenEnvironment
 from mi_nerfattack.deploy.sites import AbstractSite, expert_of, probe_expert
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.io.resumable import Record, Unit, flatten, json_digest
 from mi_nerfattack.system.workers import (
@@ -21,17 +21,16 @@ from mi_nerfattack.system.workers import (
     OnUnits,
     tally,
 )
-from mi_nerfattack.training.dataset import shard_columns
+from mi_nerfattack.training.dataset import FORMAT, SHARDS, FrameStates, shard_columns
 from mi_nerfattack.training.settings import CollectSettings
 from mi_nerfattack.training.sources import AbstractSource, Labelled, Scenery
 from mi_nerfattack.training.staging import ROADSIDE, AbstractStage, AbstractStaging
+from mi_nerfattack.vehicle.expert import AbstractExpert, future_positions
 from mi_nerfattack.vehicle.route.route import Route
 
 #: Called with frames done and frames wanted.
 OnFrames = Callable[[int, int], None]
 
-FORMAT = "mi_nerfattack frames 1"
-_SHARDS = "shard_*.safetensors"
 _REMEDY = "choose another folder for the frames, or remove this one"
 
 
@@ -85,10 +84,11 @@ def collect(
         **flatten("source", source.describe()),
         **staging.identity(),
         "routes": _digest(routes),
+        **flatten("route_names", [route.name for route in routes]),
         **flatten("expert", experts),
     }
     work = _Shards(site, tuple(routes), source, staging, settings, root, identity)
-    present = sorted(root.glob(_SHARDS))
+    present = sorted(root.glob(SHARDS))
     for path in present:
         work.unit(path).read_record()  # refuses frames of something else
     paths = [work.path(index) for index in range(settings.shards)]
@@ -111,6 +111,11 @@ class _Shards(AbstractWork):
     settings: CollectSettings
     root: Path
     identity: Mapping[str, str]
+
+    @cached_property
+    def experts(self) -> list[AbstractExpert]:
+        """Experts of the routes, in their order."""
+        return [expert_of(self.site, route) for route in self.routes]
 
     def path(self, index: int) -> Path:
         """Return the file of a shard."""
@@ -136,22 +141,59 @@ class _Shards(AbstractWork):
         )
         opened.stage.begin(rng)
         opened.shown.clear()
-        wanted, rows = self.settings.size(index), []
-        images: list[np.ndarray] = []
-        for goal, (image, control) in self._rows(opened, environment, rng):
-            rows.append((goal, control))
-            images.append(image)
+        rows, numbers = [], []
+        for number, row in self._rows(opened, environment, rng):
+            numbers.append(number)
+            rows.append(row)
             report(1)
-            if len(rows) == wanted:
+            if len(rows) == self.settings.size(index):
                 break
-        goals, controls = (np.array(column) for column in zip(*rows, strict=True))
+        goals = np.array([self.routes[number].goal for number in numbers])
+        images = np.stack([row.image for row in rows])
+        controls = np.array([row.control for row in rows])
         self.unit(self.path(index)).write(
-            shard_columns(np.stack(images), goals, controls),
+            shard_columns(images, goals, controls, self._states(numbers, rows)),
             ShardRecord(
                 conditions=asdict(conditions),
                 goals=_counts(goals),
                 objects=_counts(opened.shown),
             ),
+        )
+
+    def _states(self, numbers: Sequence[int], rows: Sequence[Labelled]) -> FrameStates:
+        """Describe where frames were taken, and where the experts go from there.
+
+        Args:
+            numbers: (n,), indices of routes.
+            rows: n frames, in the order in which they were taken.
+        """
+        site, count = self.site, len(rows)
+        poses, step = np.stack([row.pose for row in rows]), [row.step for row in rows]
+        speed, arc, error = (np.empty(count, np.float32) for _ in range(3))
+        waypoints = np.empty((count, len(self.settings.waypoints_s), 2), np.float32)
+        for number in set(numbers):
+            mine, route = np.equal(numbers, number), self.routes[number]
+            arc[mine], error[mine], _ = route.project_numpy(poses[mine])
+            speed[mine] = route.speed_ms
+            waypoints[mine] = future_positions(
+                self.experts[number],
+                poses[mine],
+                self.settings.waypoints_s,
+                speed=route.speed_ms,
+                period=site.period,
+                wheelbase=site.car.wheelbase,
+            )
+        later = np.flatnonzero(step)
+        speed[later] = _arc_lengths(poses[later - 1], poses[later]) / site.period
+        return FrameStates(
+            poses=poses,
+            speeds=speed,
+            arc_lengths=arc,
+            cross_tracks=error,
+            waypoints=waypoints,
+            drives=np.cumsum(np.equal(step, 0)) - 1,
+            steps=np.array(step),
+            routes=np.array(numbers),
         )
 
     def close(self, opened: _Opened) -> None:
@@ -164,15 +206,16 @@ class _Shards(AbstractWork):
         environment: AbstractEnvironment,
         rng: np.random.Generator,
     ) -> Iterator[tuple[int, Labelled]]:
-        """Yield goals and labelled frames without end."""
-        experts = {route.name: expert_of(self.site, route) for route in self.routes}
+        """Yield indices of routes and labelled frames without end."""
+        names = [route.name for route in self.routes]
         for route, arc, poses in _draw_states(opened.stage, self.settings, rng):
             objects = opened.stage.objects(route, arc, rng)
             opened.shown.append(len(objects))
             environment.show(objects)
-            scenery = Scenery(environment, route, experts[route.name], poses, rng)
+            number = names.index(route.name)
+            scenery = Scenery(environment, route, self.experts[number], poses, rng)
             for labelled in self.source.frames(opened.prepared, scenery):
-                yield route.goal, labelled
+                yield number, labelled
 
 
 @dataclass(eq=False)
@@ -211,18 +254,11 @@ def _draw_states(
         yield route, centre, settings.scatter.states(route, arc, rng)
 
 
-def find_shards(folder: str | Path) -> list[Path]:
-    """Return the shards anywhere below a folder, in order of their names.
-
-    Raises:
-        InputError: there are none.
-    """
-    found = sorted(Path(folder).rglob(_SHARDS))
-    if not found:
-        raise InputError(
-            f"{folder}: no frames in it; give a folder of 'mi-nerfattack train'"
-        )
-    return found
+def _arc_lengths(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Return the lengths (n,) of the arcs between poses (n, 3), metres."""
+    x, y, turn = (after - before).T
+    turn = (turn + np.pi) % (2 * np.pi) - np.pi
+    return np.hypot(x, y) / np.sinc(turn / (2 * np.pi))
 
 
 def _digest(routes: Sequence[Route]) -> str:

@@ -1,11 +1,13 @@
-"""Driving frames with goals and expert controls, read row by row from shards.
+"""Driving frames with goals, expert controls and states, read row by row from shards.
 
 A shard is one safetensors file: `frames`, uint8 (n, height, width, 3), sRGB; `goals`,
-int64 (n,); `controls`, float32 (n,), rad/s or rad. Frames stay on the disk.
+int64 (n,); `controls`, float32 (n,), rad/s or rad; and the columns of `FrameStates`.
+Frames stay on the disk.
 """
 
 from __future__ import annotations
 
+import json
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +19,39 @@ import numpy as np
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.io.resumable import array_digest
+
+#: Format of a shard in its metadata.
+FORMAT = "mi_nerfattack frames 2"
+#: Names of the files of shards.
+SHARDS = "shard_*.safetensors"
+
+
+@dataclass(frozen=True, eq=False)
+class FrameStates:
+    """Where the n frames of a shard were taken, and where the expert goes from there.
+
+    Args:
+        poses: (n, 3) float64 of the vehicle, x and y in metres, heading in radians.
+        speeds: (n,) float32, metres per second, over the control period that ends with
+            the frame; the route's speed at the first frame of a drive.
+        arc_lengths: (n,) float32, of the nearest point of the route, metres.
+        cross_tracks: (n,) float32, signed cross-track error, metres, positive on the
+            left.
+        waypoints: (n, k, 2) float32, the expert's positions at k times ahead, metres
+            forward and to the left, see `vehicle.expert.future_positions`.
+        drives: (n,) int64, number of the drive within the shard.
+        steps: (n,) int64, control periods since the drive began.
+        routes: (n,) int64, index of the route in the shard's `route_names`.
+    """
+
+    poses: np.ndarray
+    speeds: np.ndarray
+    arc_lengths: np.ndarray
+    cross_tracks: np.ndarray
+    waypoints: np.ndarray
+    drives: np.ndarray
+    steps: np.ndarray
+    routes: np.ndarray
 
 
 class FramesFile:
@@ -119,9 +154,14 @@ class FrameDataset:
         columns = (*self.frames, self.goals, self.controls)
         return array_digest(column[np.arange(len(column))] for column in columns)
 
+    @cached_property
+    def _starts(self) -> np.ndarray:
+        """Row numbers at which shards begin, and their end."""
+        return np.cumsum([0, *(len(array) for array in self.frames)])
+
     def read_frames(self, rows: np.ndarray) -> np.ndarray:
         """Copy frames (k, height, width, 3) uint8 of the given row numbers (k,)."""
-        starts = np.cumsum([0, *(len(array) for array in self.frames)])
+        starts = self._starts
         result = np.empty((len(rows), *self.frames[0].shape[1:]), np.uint8)
         shard = np.searchsorted(starts, rows, side="right") - 1
         for number in np.unique(shard):
@@ -159,7 +199,10 @@ class FrameDataset:
 
 
 def shard_columns(
-    frames: np.ndarray, goals: np.ndarray, controls: np.ndarray
+    frames: np.ndarray,
+    goals: np.ndarray,
+    controls: np.ndarray,
+    states: FrameStates | None = None,
 ) -> dict[str, np.ndarray]:
     """Check and name what a shard holds.
 
@@ -167,6 +210,7 @@ def shard_columns(
         frames: (n, height, width, 3) uint8, sRGB.
         goals: (n,) integers.
         controls: (n,) rad/s or rad.
+        states: of the vehicle; None where nothing but controls is imitated.
 
     Raises:
         InputError: shapes or types that do not fit, controls that are not finite.
@@ -176,7 +220,28 @@ def shard_columns(
         np.asarray(goals, np.int64),
         np.asarray(controls, np.float32),
     )
-    return {"frames": frames, "goals": data.goals, "controls": data.controls}
+    columns = {"frames": frames, "goals": data.goals, "controls": data.controls}
+    return columns if states is None else columns | vars(states)
+
+
+def find_shards(folder: str | Path) -> list[Path]:
+    """Return the shards anywhere below a folder, in order of their names.
+
+    Raises:
+        InputError: there are none.
+    """
+    found = sorted(Path(folder).rglob(SHARDS))
+    if not found:
+        raise InputError(
+            f"{folder}: no frames in it; give a folder of 'mi-nerfattack train'"
+        )
+    return found
+
+
+def control_unit_of(shard: Path) -> str | None:
+    """Return the unit of a shard's controls; None where its site does not say it."""
+    _, metadata = files.read_safetensors(shard, ())
+    return json.loads(metadata.get("site.car.control_unit", "null"))
 
 
 def divide_shards(

@@ -12,14 +12,18 @@ import torch
 
 from mi_nerfattack.deploy.sites import AbstractSite
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.evaluation.evaluate import check_places
+from mi_nerfattack.evaluation.evaluate import EvaluateSettings, check_places
 from mi_nerfattack.io import files
 from mi_nerfattack.io.locks import exclusive, remove_partial
 from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, MOST_GOALS, PilotNet
 from mi_nerfattack.rollout.drive import departure_limits
 from mi_nerfattack.system.workers import AbstractWorkers
 from mi_nerfattack.training.collect import OnFrames, collect
-from mi_nerfattack.training.dataset import FrameDataset, divide_shards
+from mi_nerfattack.training.dataset import (
+    FrameDataset,
+    control_unit_of,
+    divide_shards,
+)
 from mi_nerfattack.training.settings import ImitationSettings
 from mi_nerfattack.training.sources import AbstractSource, PolicyDrives
 from mi_nerfattack.training.staging import ROADSIDE, AbstractStaging
@@ -82,7 +86,9 @@ def imitate(
             that do not fit, objects without a place, or another process that works in
             the folder; then, where the folder holds what was made with other settings.
     """
-    _check(sites, routes, settings, more)
+    _check_wanted(sites, routes, settings, more)
+    _check_policy(sites, routes, settings, more)
+    _check_places(sites, routes, settings, (settings.validation, settings.final))
     torch.manual_seed(settings.seed)
     car = sites[0].car
     goals = 1 + max(route.goal for route in routes)
@@ -98,6 +104,30 @@ def imitate(
         arguments = (settings, Path(folder), workers, progress, staging)
         run = _Imitation(sites, routes, *arguments)
         return run.run(module, more)
+
+
+def collect_frames(
+    sites: Sequence[AbstractSite],
+    routes: Sequence[Route],
+    settings: ImitationSettings,
+    folder: str | Path,
+    workers: AbstractWorkers,
+    progress: OnStage = lambda stage, done, total, state: None,
+    staging: AbstractStaging = ROADSIDE,
+) -> list[Path]:
+    """Collect the frames of the first training; return all shards, train nothing.
+
+    Images may have any size. If they have PilotNet's, `imitate` with the same arguments
+    trains on these frames. Arguments and errors are those of `imitate`.
+    """
+    _check_wanted(sites, routes, settings, ())
+    _check_places(sites, routes, settings, ())
+    with exclusive(files.make_folder(folder)):
+        remove_partial(folder)  # of killed writers
+        arguments = (settings, Path(folder), workers, progress, staging)
+        run = _Imitation(sites, routes, *arguments)
+        first, held_out = run.collect_first()
+        return [*first, *held_out]
 
 
 @dataclass(eq=False)
@@ -118,12 +148,9 @@ class _Imitation:
     def run(self, module: PilotNet, more: Sequence[Path]) -> Imitated:
         """Do all stages, beginning with the weights of `module`."""
         settings = self.settings
-        self.take(
-            [*more, *self.collect("round_0", settings.frames, settings.cloning, 0)]
-        )
-        self.held_out += self.collect(
-            "held_out", settings.validation_frames, settings.cloning, _HELD_OUT
-        )
+        first, held_out = self.collect_first()
+        self.take([*more, *first])
+        self.held_out += held_out
         with self:
             history = [self.train(module, 0)]
             weights = [self.save(module, 0)]
@@ -171,6 +198,13 @@ class _Imitation:
     def _validated(self) -> list[AbstractSite]:
         chosen = self.settings.validate_in
         return [site for site in self.sites if not chosen or site.name in chosen]
+
+    def collect_first(self) -> tuple[list[Path], list[Path]]:
+        """Collect the frames of the first training, and the held-out ones, if any."""
+        settings, source = self.settings, self.settings.cloning
+        first = self.collect("round_0", settings.frames, source, 0)
+        wanted = settings.validation_frames
+        return first, self.collect("held_out", wanted, source, _HELD_OUT)
 
     def collect(
         self, name: str, frames: Mapping[str, int], source: AbstractSource, number: int
@@ -256,7 +290,7 @@ class _Imitation:
         )
 
 
-def _check(
+def _check_wanted(
     sites: Sequence[AbstractSite],
     routes: Sequence[Route],
     settings: ImitationSettings,
@@ -271,6 +305,16 @@ def _check(
             f"imitate: {frames} frames of {names}, {len(routes)} routes; at least one "
             "frame and one route"
         )
+
+
+def _check_policy(
+    sites: Sequence[AbstractSite],
+    routes: Sequence[Route],
+    settings: ImitationSettings,
+    more: Sequence[Path],
+) -> None:
+    """Raise `InputError` for what PilotNet cannot be trained on."""
+    frames = sum(settings.frames.values())
     for route in routes:
         if route.goal >= MOST_GOALS:
             raise InputError(
@@ -286,32 +330,32 @@ def _check(
             f"frames: {frames}, one shard of up to {size}; at least two, of which one "
             "is held out, or give validation_frames"
         )
-    _check_objects(sites[0], routes, settings)
-    # what cannot be made is told now, not after the hours of those before it
-    for site in sites:
-        site.open(site.typical()).close()
 
 
-def _check_objects(
-    site: AbstractSite, routes: Sequence[Route], settings: ImitationSettings
+def _check_places(
+    sites: Sequence[AbstractSite],
+    routes: Sequence[Route],
+    settings: ImitationSettings,
+    measured: Sequence[EvaluateSettings],
 ) -> None:
-    """Raise `InputError` for objects that find no place."""
-    measured = (settings.validation, settings.final)
+    """Raise `InputError` for objects without a place, or a site that does not open."""
     for drives in measured:
         departure_limits(routes, drives.car_width_m)
     collecting = settings.collecting
     wanted = collecting.objects if collecting.object_share else 0
-    most = max(wanted, *(drives.most for drives in measured))
-    objects = site.load_objects(most) if most else []
-    if not objects:
-        return
-    surroundings = site.load_surroundings()
-    for drives in measured:
-        check_places(site.period, routes, objects, surroundings, drives)
-    if wanted:  # near the ends of a route there may be none; somewhere there must
+    most = max([wanted, *(drives.most for drives in measured)])
+    objects = sites[0].load_objects(most) if most else []
+    if objects:
+        surroundings = sites[0].load_surroundings()
+        for drives in measured:
+            check_places(sites[0].period, routes, objects, surroundings, drives)
+        # near the ends of a route there may be no place; somewhere there must
         rng, rule = np.random.default_rng(settings.seed), collecting.roadside
-        for route in routes:
+        for route in routes if wanted else ():
             rule.draw(objects[:1], surroundings, route, (0.0, route.length), rng)
+    # what cannot be made is told now, not after the hours of those before it
+    for site in sites:
+        site.open(site.typical()).close()
 
 
 def check_camera(site: AbstractSite) -> None:
@@ -321,7 +365,8 @@ def check_camera(site: AbstractSite) -> None:
     if (camera.width, camera.height) != (width, height):
         raise InputError(
             f"camera of {site.name!r}: {camera.width} x {camera.height} px; PilotNet "
-            f"takes {width} x {height}"
+            f"takes {width} x {height}: change the camera, or collect frames alone "
+            "('mi-nerfattack train --frames-only') and train your own network"
         )
 
 
@@ -334,6 +379,10 @@ def _check_frames(module: PilotNet, shards: Sequence[Path]) -> None:
                 f"{shard}: frames of {width} x {height} px; PilotNet takes "
                 f"{IMAGE_SHAPE[1]} x {IMAGE_SHAPE[0]}"
             )
+        unit = control_unit_of(shard)
+        if unit not in (None, module.unit):
+            need = f"the policy's are in {module.unit}: leave these frames out"
+            raise InputError(f"{shard}: controls in {unit}; {need}")
         try:
             check_labels(module, data)
         except InputError as error:

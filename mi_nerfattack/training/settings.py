@@ -9,7 +9,7 @@ from mi_nerfattack.deploy.place import Scatter
 from mi_nerfattack.deploy.roadside.rule import Roadside
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import EvaluateSettings
-from mi_nerfattack.ranges import Count, Fraction, Share, Whole, checked
+from mi_nerfattack.ranges import Count, Fraction, Positive, Share, Whole, checked
 from mi_nerfattack.training.sources import (
     AbstractSource,
     ExpertDrives,
@@ -43,6 +43,7 @@ class CollectSettings:
             too.
         scatter: deviations of the states from the route.
         roadside: the rule by which the objects stand.
+        waypoints_s: times ahead of the expert's future positions, seconds, ascending.
     """
 
     frames: Count = 9000
@@ -57,6 +58,14 @@ class CollectSettings:
     margin_m: float = 2.0
     scatter: Scatter = field(default_factory=Scatter)
     roadside: Roadside = field(default_factory=Roadside)
+    waypoints_s: tuple[Positive, ...] = (0.5, 1.0, 1.5, 2.0)
+
+    def __post_init__(self) -> None:
+        times = self.waypoints_s
+        if not times or list(times) != sorted(set(times)):
+            raise InputError(
+                f"CollectSettings.waypoints_s: {times}; at least one time, ascending"
+            )
 
     @property
     def shards(self) -> int:

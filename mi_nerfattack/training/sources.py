@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -19,8 +19,21 @@ from mi_nerfattack.ranges import Share, checked
 from mi_nerfattack.vehicle.expert import AbstractExpert
 from mi_nerfattack.vehicle.route.route import Route
 
-#: An image (height, width, 3) uint8 sRGB and the expert's control there.
-Labelled = tuple[np.ndarray, float]
+
+class Labelled(NamedTuple):
+    """A frame of a drive.
+
+    Args:
+        image: (height, width, 3), uint8 sRGB.
+        control: the expert's, in the unit of the vehicle.
+        pose: (3,) of the vehicle, x and y in metres, heading in radians.
+        step: control periods since the drive began; 0 begins another drive.
+    """
+
+    image: np.ndarray
+    control: float
+    pose: np.ndarray
+    step: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +59,11 @@ class Scenery:
         seed = int(self.rng.integers(2**31))
         return self.environment.reset(self.route, pose, seed).image
 
-    def label(self) -> float:
-        """Return the expert's control of the vehicle's state."""
-        return float(self.expert.control(self.environment.state)[0])
+    def label(self, image: np.ndarray, step: int) -> Labelled:
+        """Add the vehicle's pose and the expert's control to the image of a step."""
+        state = self.environment.state
+        control = float(self.expert.control(state)[0])
+        return Labelled(image, control, np.array(state[:3], np.float64), step)
 
     @property
     def strayed(self) -> bool:
@@ -95,7 +110,7 @@ class Scattered(AbstractSource):
     def frames(self, prepared: None, scenery: Scenery) -> Iterator[Labelled]:
         """See and label the poses."""
         for pose in scenery.poses:
-            yield scenery.reset(pose), scenery.label()
+            yield scenery.label(scenery.reset(pose), 0)
 
 
 @dataclass(frozen=True)
@@ -118,13 +133,12 @@ class ExpertDrives(AbstractSource):
 
     def frames(self, prepared: None, scenery: Scenery) -> Iterator[Labelled]:
         """Drive."""
-        image = scenery.reset(scenery.poses[0])
-        yield image, (control := scenery.label())
-        for _ in range(self.horizon - 1):
-            image = scenery.environment.step(control).image
+        yield (frame := scenery.label(scenery.reset(scenery.poses[0]), 0))
+        for step in range(1, self.horizon):
+            image = scenery.environment.step(frame.control).image
             if scenery.strayed:
                 return
-            yield image, (control := scenery.label())
+            yield (frame := scenery.label(image, step))
 
 
 @dataclass(frozen=True)
@@ -160,15 +174,15 @@ class PolicyDrives(AbstractSource):
 
     def frames(self, prepared: PilotNet, scenery: Scenery) -> Iterator[Labelled]:
         """Drive until the horizon, or until the vehicle has strayed."""
-        image = scenery.reset(scenery.poses[0])
-        yield image, (control := scenery.label())
-        for _ in range(self.horizon - 1):
+        yield (frame := scenery.label(scenery.reset(scenery.poses[0]), 0))
+        for step in range(1, self.horizon):
+            control = frame.control
             if scenery.rng.uniform() >= self.expert_share:
-                control = steer(prepared, image, scenery.route.goal)
+                control = steer(prepared, frame.image, scenery.route.goal)
             image = scenery.environment.step(control).image
             if scenery.strayed:
                 return
-            yield image, (control := scenery.label())
+            yield (frame := scenery.label(image, step))
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import json
+import pickle
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
+import numpy as np
 import pytest
+from support.faults.refusals import refusals
+from support.worlds.places import write_place
 
+import mi_nerfattack as nf
 from mi_nerfattack import cli
+from mi_nerfattack.commands.retrain import Retrain
 from mi_nerfattack.commands.train import Train
 from mi_nerfattack.deploy.place import bundled_place
 from mi_nerfattack.experiment.retrain.solvable import drive_expert
@@ -19,6 +26,7 @@ from mi_nerfattack.io import files
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.rollout.drive import departure_limit
 from mi_nerfattack.training.presets import find_preset
+from mi_nerfattack.vehicle.expert import expert_for
 from mi_nerfattack.vehicle.route.route import load_routes
 from tests.faults import worlds
 
@@ -138,6 +146,27 @@ def check_table(about: dict, folder: Path, *more: str) -> None:
         assert row["clean_ratio"] == pytest.approx(ratio)
 
 
+def test_workers_make_the_vehicle_of_a_runs_user(run, tmp_path, monkeypatch):
+    """A process that never loaded the user's file opens the place."""
+    vehicle = f"[vehicle]\n{CUSTOM}trust_code = true\n".replace('"rad"', '"rad/s"')
+    custom = changed(run, tmp_path / "custom", ("[drive]", f"{vehicle}[drive]"))
+    (custom / "car.py").write_text(CAR)
+    (found,) = read_found([custom])
+    command = Retrain((custom,), tmp_path / "o", tmp_path / "d", exposures_ev=(0.0,))
+    place = command._place([found])
+    settings = command._settings(Path(found.scenario.policy.file.file), place)
+    sent = pickle.dumps(command._sites(place, settings, found.scenario.vehicle))
+    for name in [name for name in sys.modules if name.startswith("mi_nerfattack_user")]:
+        monkeypatch.delitem(sys.modules, name)
+    for site in pickle.loads(sent):
+        environment = site.open(site.typical())
+        environment.reset(found.route)
+        environment.step(0.0)
+        moved = np.hypot(*(environment.state[:2] - found.route.points[0]))
+        assert moved == pytest.approx(0.6, rel=1e-3)  # 6 m/s, as only its file says
+        environment.close()
+
+
 def test_the_expert_decides_what_can_be_driven(run, tmp_path):
     (found,) = read_found([run])
     driven = drive_expert(found)
@@ -195,15 +224,113 @@ def test_what_cannot_be_written_is_told_before_the_first_frame(tmp_path, capsys,
 
 def test_frames_of_rounds_that_are_not_done_need_no_environment():
     """The preset's rounds have surrogate frames, and this room has no field."""
-    train = Train(Path("o"), Path("d"), frames={"mitsuba": 8}, dagger_rounds=0)
+    train = Train(Path("d"), frames={"mitsuba": 8}, dagger_rounds=0)
     preset, room = train._preset(), replace(bundled_place("room"), field=None)
-    settings = train._settings(preset)
-    assert [site.name for site in train._sites(preset, room, settings)] == ["mitsuba"]
+    sites = train._sites(preset, room, train._settings(preset, room), train._file())
+    assert [site.name for site in sites] == ["mitsuba"]
 
 
 def test_a_rooms_policy_is_validated_within_its_lane():
-    settings = Train(Path("o"), Path("d"))._settings(find_preset("room"))
-    (route,) = load_routes(bundled_place("room").routes)
+    room = bundled_place("room")
+    settings = Train(Path("d"))._settings(find_preset("room"), room)
+    (route,) = load_routes(room.routes)
     for chosen in (settings.validation, settings.final):
         assert departure_limit(route.lane_width_m, chosen.car_width_m) > 0.15
     assert settings.final.seed != settings.validation.seed
+
+
+LIKE = """[policy]
+file = "not_trained_yet.pt"
+[camera]
+width = 24
+height = 10
+[vehicle]
+dt_s = 0.05
+"""
+ACKERMANN = """kind = "ackermann"
+speed_ms = 6.0
+wheelbase_m = 2.9
+"""
+CUSTOM = """kind = "custom"
+function = "car.py:car"
+control_limit = 0.6
+control_unit = "rad"
+wheelbase_m = 2.9
+"""
+CAR = """import drjit as dr
+def car(state, control):
+    return 6 * dr.cos(state[2]), 6 * dr.sin(state[2]), 6 / 2.9 * dr.tan(control)
+"""
+
+
+def like(folder: Path, vehicle: str) -> str:
+    """Write a policy's file and a vehicle, and return the name of the former."""
+    (folder / "car.py").write_text(CAR)
+    (folder / "like.toml").write_text(LIKE + vehicle)
+    return str(folder / "like.toml")
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "speed"), [(ACKERMANN, 6.0), (CUSTOM, 5.0)], ids=["built-in", "custom"]
+)
+def test_frames_have_the_camera_and_the_vehicle_of_a_policys_file(
+    tmp_path, vehicle, speed, capsys
+):
+    """The expert knows the speed of a custom vehicle from the route alone."""
+    place = write_place(tmp_path)
+    words = ["train", "--frames-only", "--data", tmp_path / "data", "--workers", 1]
+    words += ["--scene", place.scene, "--routes-file", place.routes, "--seed", 3]
+    words += ["--frames", "mitsuba", 40, "--most-objects", 0, "--spp", 1, "--json"]
+    words += ["--like", like(tmp_path, vehicle), "--set", "vehicle.trust_code=true"]
+    if vehicle == ACKERMANN:
+        words = words[:-2]
+    assert cli.main([str(word) for word in words]) == 0
+    assert json.loads(capsys.readouterr().out) == {"data": {"round_0/mitsuba": 40}}
+    frames = nf.frames(tmp_path / "data")
+    assert len(frames) == 40 and frames[0].image.shape == (3, 10, 24)
+    routes = {
+        route.name: replace(route, speed_ms=speed)
+        for route in load_routes(place.routes)
+    }
+    limit = float(np.radians(34.0)) if vehicle == ACKERMANN else 0.6
+    measured = []
+    for item in (frames[row] for row in range(40)):
+        route = routes[frames.routes[int(item.route)]]
+        expert = expert_for("rad", route, 0.05, limit, 2.9)
+        (control,) = expert.control(item.pose.numpy())
+        assert item.control.item() == pytest.approx(control, rel=1e-5, abs=1e-7)
+        if item.step:
+            measured.append(item.speed.item())
+    assert measured and measured == pytest.approx([6.0] * len(measured), rel=1e-5)
+
+
+def training(change: dict, vehicle: str = ACKERMANN):
+    """Return a call of train with a policy's file, and other options."""
+
+    def call(folder: Path) -> None:
+        options = {"frames": {"surrogate": 128}, "like": like(folder, vehicle)}
+        options |= {"data": folder / "data"} | change
+        Train(**options).run()
+
+    return call
+
+
+def without_sections(folder: Path) -> None:
+    (folder / "bare.toml").write_text('[policy]\nfile = "a.pt"\n')
+    training({"like": str(folder / "bare.toml"), "frames_only": True})(folder)
+
+
+ONLY, UNIT = {"frames_only": True}, 'control_unit = "rad"\nwheelbase_m = 2.9\n'
+test_what_cannot_be_collected_is_refused = refusals(
+    (training({}), "-o: is missing; .*--frames-only"),
+    (training(ONLY | {"output": Path("a")}), "--output: has no effect"),
+    (training(ONLY | {"more": (Path("a"),)}), "--more: has no effect"),
+    (training(ONLY | {"like": None, "settings": ("a=1",)}), "--set: .*--like"),
+    (without_sections, r"bare.toml; has neither \[camera\] nor \[vehicle\]"),
+    (training(ONLY, CUSTOM.replace(UNIT, "")), "vehicle.control_unit: is missing"),
+    (
+        training(ONLY | {"frames": {"mujoco": 8}}, CUSTOM + "trust_code = true"),
+        "--frames: mujoco drives a car with wheels",
+    ),
+    (training({"output": Path("a.safetensors")}), "24 x 10 px; .*--frames-only"),
+)

@@ -66,6 +66,7 @@ HOLDS = {
     "pytorch_user": lambda *x: len(x) == 7 and x[4] > x[0],  # errors after iterations
     "robotics_user": lambda *errors: len(errors) == 3 and max(errors) < 0.3,
     "renderer_user": lambda *others: others[-1] > 20,  # dB
+    "training_user": lambda before, after: after < before / 4,  # metres
     "gymnasium_user": lambda *x: x[-1] == max(x[:-1]) > min(x[:-1]),
 }
 

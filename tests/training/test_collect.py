@@ -29,8 +29,8 @@ from mi_nerfattack.io import files
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.render.camera.intrinsics import from_fov
 from mi_nerfattack.system.workers import InThisProcess
-from mi_nerfattack.training.collect import collect, find_shards
-from mi_nerfattack.training.dataset import FrameDataset
+from mi_nerfattack.training.collect import collect
+from mi_nerfattack.training.dataset import FrameDataset, find_shards
 from mi_nerfattack.training.sources import (
     ExpertDrives,
     Mixture,

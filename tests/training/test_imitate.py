@@ -21,8 +21,7 @@ from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, PilotNet
 from mi_nerfattack.report.pages.policy import training_facts
 from mi_nerfattack.system.workers import InThisProcess
 from mi_nerfattack.training import imitate as module
-from mi_nerfattack.training.collect import find_shards
-from mi_nerfattack.training.dataset import FrameDataset
+from mi_nerfattack.training.dataset import FrameDataset, find_shards
 from mi_nerfattack.training.imitate import Imitated, imitate
 from mi_nerfattack.training.presets import PRESETS, find_preset
 from mi_nerfattack.training.record import (
@@ -279,6 +278,14 @@ def frames_of(size_px, goal):
     return lambda folder: [write_shard(folder / "other", frames, [goal], [0.0])]
 
 
+def steered(folder):
+    """Frames of a car that is steered by an angle."""
+    (shard,) = frames_of((200, 66), 0)(folder)
+    tensors, _ = files.read_safetensors(shard)
+    files.write_safetensors(shard, tensors, {"site.car.control_unit": '"rad"'})
+    return [shard]
+
+
 BOTH = dataclasses.replace(SETTINGS, frames={"mitsuba": 64, "mujoco": 1})
 MISSING = [SITE, MissingSite("mujoco", size_px=(200, 66))]
 
@@ -291,6 +298,7 @@ MISSING = [SITE, MissingSite("mujoco", size_px=(200, 66))]
         ({"start": PilotNet(2, unit="rad")}, r"start: .*\(2, 1.5, 'rad/s'\)"),
         ({"more": frames_of((100, 50), 0)}, "other.safetensors: .* 100 x 50 px"),
         ({"more": frames_of((200, 66), 2)}, "other.safetensors: goals: 2 to 2"),
+        ({"more": steered}, "other.safetensors: controls in rad; .* in rad/s: leave"),
         ({"sites": MISSING, "settings": BOTH}, "pip install it"),
     ],
 )

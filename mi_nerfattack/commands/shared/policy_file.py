@@ -107,6 +107,22 @@ class PolicyFile:
         wheelbase_m = round(vehicle.car().wheelbase, 6)
         return vehicle.unit, wheelbase_m if vehicle.unit == "rad" else None
 
+    def check_wheels(self, option: str, environments: Sequence[str]) -> None:
+        """Raise `InputError` if a custom vehicle is to drive where cars have wheels.
+
+        Args:
+            option: that names the environments.
+            environments: their names.
+        """
+        from mi_nerfattack.scenario.vehicle import CustomSection
+
+        wheels = [name for name in environments if name.startswith("mujoco")]
+        if wheels and isinstance(self.vehicle, CustomSection):
+            raise InputError(
+                f"{option}: {wheels[0]} drives a car with wheels, whose control is not "
+                "that of a custom vehicle; leave it out"
+            )
+
     def place(self, place: Place, is_chosen: bool) -> Place:
         """Return where the policy drives, with its camera and its car.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from mi_nerfattack.ranges import Acute, Positive, checked
 from mi_nerfattack.vehicle.route.route import Route
-from mi_nerfattack.vehicle.steering import steering_angle
+from mi_nerfattack.vehicle.steering import heading_rate, steering_angle
 
 
 class AbstractExpert(ABC):
@@ -114,3 +115,57 @@ class SteeringFollower(AbstractExpert):
         rate = self.follower.control(states)
         angle = steering_angle(rate, float(self.follower.speed or 0), self.wheelbase)
         return np.clip(angle, -self.max_control, self.max_control)
+
+
+def future_positions(
+    expert: AbstractExpert,
+    poses: np.ndarray,
+    times: Sequence[float],
+    *,
+    speed: float,
+    period: float,
+    wheelbase: float,
+) -> np.ndarray:
+    """Drive with an expert from several poses, and return where it comes.
+
+    The vehicle is kinematic: its speed is constant, its wheels answer at once, and it
+    holds the control of each period. So it moves along arcs, which are exact here.
+
+    Args:
+        expert: gives the control at the start of each period.
+        poses: (n, 3), x and y in metres, heading in radians; may be beside the lane.
+        times: k times ahead, seconds, at least 0.
+        speed: metres per second.
+        period: seconds that a control is held.
+        wheelbase: metres, of an expert that gives steering angles.
+
+    Returns:
+        (n, k, 2), metres forward and to the left of each pose.
+    """
+    ahead = np.asarray(times, np.float64)
+    whole = np.floor(ahead / period + 1e-6)  # periods before the last one
+    start = np.asarray(poses, np.float64)[:, :3]
+    state, world = start, np.empty((len(start), len(ahead), 2))
+    for step in range(int(whole.max()) + 1):
+        rate = expert.control(state)
+        if expert.control_unit == "rad":
+            rate = heading_rate(rate, speed, wheelbase)
+        for index in np.flatnonzero(whole == step):
+            seconds = max(0.0, ahead[index] - step * period)
+            world[:, index] = _along_arc(state, rate, speed, seconds)[:, :2]
+        state = _along_arc(state, rate, speed, period)
+    offset, heading = world - start[:, None, :2], start[:, 2:]
+    dx, dy = offset[..., 0], offset[..., 1]
+    cos, sin = np.cos(heading), np.sin(heading)
+    return np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=-1)
+
+
+def _along_arc(
+    states: np.ndarray, rate: np.ndarray, speed: float, seconds: float
+) -> np.ndarray:
+    """Move states (n, 3) at heading rates (n,), rad/s, and a speed in m/s."""
+    turn = rate * seconds
+    chord = speed * seconds * np.sinc(turn / (2 * np.pi))
+    middle = states[:, 2] + turn / 2
+    step = [chord * np.cos(middle), chord * np.sin(middle), turn]
+    return states + np.stack(step, axis=-1)

@@ -13,6 +13,7 @@ import pytest
 from support.worlds import attacks as attack_jobs
 from support.worlds.places import PaintedSite, small
 
+import mi_nerfattack as nf
 from mi_nerfattack.capture.mesh.flat import FlatObject
 from mi_nerfattack.deploy.sites import PlaceSite, Weather
 from mi_nerfattack.errors import InputError
@@ -87,6 +88,10 @@ def test_a_shard_shows_one_runs_objects_where_its_attack_left_them(found, tmp_pa
     objects = [items for item in site.opened for items in item.seen]
     states = [state for item in site.opened for state in item.states]
     assert len(objects) == len(states) == 96
+    frames = nf.frames(tmp_path)  # as those of train
+    poses = np.stack([frames[row].pose.numpy() for row in range(96)])
+    np.testing.assert_array_equal(poses, states)
+    assert frames.routes == (found[0].route.name,)
     seen = set()
     for (posed,), state in zip(objects, states, strict=True):
         number = int(posed.pose.translation[0] == 12)

@@ -14,7 +14,12 @@ from mi_nerfattack.deploy.registry import kinematic_vehicle
 from mi_nerfattack.deploy.vehicle import KinematicVehicle, Motion
 from mi_nerfattack.vehicle import Route, load_routes
 from mi_nerfattack.vehicle.bicycle import RateLimitedAckermann
-from mi_nerfattack.vehicle.expert import LaneFollower, SteeringFollower, expert_for
+from mi_nerfattack.vehicle.expert import (
+    LaneFollower,
+    SteeringFollower,
+    expert_for,
+    future_positions,
+)
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -121,3 +126,36 @@ def test_steering_of_the_lane_follower():
     np.testing.assert_allclose(rates[2], -1.5)
     np.testing.assert_allclose(angles[:2], np.arctan(wheelbase * rates[:2] / speed))
     assert angles[2] == -0.6
+
+
+@pytest.mark.parametrize("unit", ["rad/s", "rad"])
+def test_future_positions_are_those_of_small_steps(unit):
+    """Heun's method with 0.1 ms; the control is held for a period of 0.1 s."""
+    route, speed, wheelbase, period = circle(12.0, 5.0), 5.0, 2.5, 0.1
+    expert = expert_for(unit, route, period, 0.6, wheelbase)
+    lateral, heading = np.array([0.0, 1.2, -0.8]), np.array([0.0, 0.3, -0.2])
+    poses = route.pose_at(np.array([3.0, 40.0, 75.0]), lateral, heading)
+    times = (0.07, 0.5, 1.0, 1.25)
+    found = future_positions(
+        expert, poses, times, speed=speed, period=period, wheelbase=wheelbase
+    )
+    assert found.shape == (3, 4, 2)
+
+    ratio = speed / wheelbase
+    for pose, positions in zip(poses, found, strict=True):
+        x, y, theta = pose
+        path, small, rate = [], 1e-4, 0.0
+        for step in range(12_501):
+            path.append((x, y))
+            if step % 1000 == 0:
+                (control,) = expert.control(np.array([x, y, theta]))
+                rate = ratio * np.tan(control) if unit == "rad" else control
+            after = theta + small * rate
+            x += small * speed * (np.cos(theta) + np.cos(after)) / 2
+            y += small * speed * (np.sin(theta) + np.sin(after)) / 2
+            theta = after
+        offset = np.array(path)[[700, 5000, 10_000, 12_500]] - pose[:2]
+        ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
+        left = np.array([-ahead[1], ahead[0]])
+        expected = np.stack([offset @ ahead, offset @ left], axis=1)
+        np.testing.assert_allclose(positions, expected, atol=1e-6)
