@@ -200,7 +200,7 @@ def _told(members: tuple[Any, ...], what: str, kind: str, key: str) -> str:
 
 
 def _kinds_of(member: Any) -> tuple[str, ...]:
-    return get_args(get_type_hints(member, include_extras=True)["kind"])
+    return get_args(get_type_hints(member)["kind"])
 
 
 def _error(

@@ -192,6 +192,7 @@ WRITERS = {
     "capture video absent -o out": "",
     "asset mesh absent -o a.safetensors": "a.report",
     "asset cube --edge-m 1 -o a.safetensors": "",
+    "asset flat patch --width-m 1 --height-m 2 -o a.safetensors": "",
     "asset folder absent -o a.safetensors": "",
     "render frame absent -o a.exr": "",
     "render compare absent absent --routes-file absent -o out": "",

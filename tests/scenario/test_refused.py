@@ -37,6 +37,8 @@ route = "lane" -> => :2: scene.route: is missing
 [[objects]]; id = "hydrant"; field = "a"; position_m = [0, 0, 0] => hydrant.*differ
 [[objects]]; id = "scene1"; field = "a"; position_m = [0, 0, 0] => scene1.*layers
 [[objects]]; id = "background"; field = "a"; position_m = [0, 0, 0] => background.*lay
+[[objects]]; id = "b"; colour = 1 => objects.1.colour: unknown key; .*"field": .*scale
+[[objects]]; id = "b"; width_m = 1 => objects.1.width_m: .*"billboard" or "patch"
 [[objects]]; kind = "wall"; id = "b" => objects.1.kind: is 'wall'; one of .*billboard
 [[objects]]; kind = "patch"; id = "b"; width_m = 1 => objects.1.height_m: is missing
 [[objects]]; kind = "patch"; id = "b"; width_m = 1; height_m = 2 => 1.position_m: is mi
