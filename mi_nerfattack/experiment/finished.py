@@ -100,17 +100,21 @@ class Finished:
         Neither the reduction over poses nor penalties on textures are in it. None where
         it has no value, of which `uncosted` says why.
         """
-        found = {drive: self._cost(drive) for drive in self.driven}
-        return {k: None if isinstance(v, str) else v for k, v in found.items()}
+        found = self._costs_or_reasons.items()
+        return {k: None if isinstance(v, str) else v for k, v in found}
 
     @cached_property
     def uncosted(self) -> dict[str, str]:
         """Environments in which the objective of a drive has no value, and why."""
         found = dict(self._other_models)
-        for drive in self.driven:
-            if isinstance(reason := self._cost(drive), str):
+        for drive, reason in self._costs_or_reasons.items():
+            if isinstance(reason, str):
                 found.setdefault(drive.environment, reason)
         return found
+
+    @cached_property
+    def _costs_or_reasons(self) -> dict[Drive, float | str]:
+        return {drive: self._cost(drive) for drive in self.driven}
 
     def _cost(self, drive: Drive) -> float | str:
         """Return the objective of a drive, or why there is none."""

@@ -47,7 +47,10 @@ def metrics_table(document: Document) -> Table:
         Column("95 % (m)", "cross_track_mean_ci95_m", terminal=False),
         largest,
         Column(
-            *("wheel out (s)", "wheel_out_s", 2, "wheel\nout (s)"),
+            "wheel out (s)",
+            "wheel_out_s",
+            2,
+            short="wheel\nout (s)",
             terminal=document.get("objective") is None,  # 80 characters have no room
         ),
         Column("centre out (s)", "centre_out_s", 2, terminal=False),

@@ -1,0 +1,74 @@
+"""What `check` finds of a vehicle: speeds that differ, units that nothing says."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from mi_nerfattack.experiment.checks.before_attack import speed_findings, unit_findings
+from mi_nerfattack.scenario.scenario import load_scenario
+from mi_nerfattack.scenario.world import build_world
+
+pytestmark = pytest.mark.usefixtures("variant", "no_results")
+
+CAR = """\
+import drjit as dr
+
+def car(state, control):
+    _, _, theta, speed = state
+    return speed * dr.cos(theta), speed * dr.sin(theta), control, speed - speed
+"""
+CUSTOM = """[vehicle]
+kind = "custom"
+function = "car.py:car"
+trust_code = true
+state_size = 4
+control_limit = 1.5
+rest_state = [9.0]
+"""
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "drive", "numbers"),
+    [
+        ("", "horizon = 4", []),
+        ("[vehicle]\nspeed_ms = 8", "horizon = 4", ["8", "5", "4", "3.2", "4", "2.0"]),
+        ("[vehicle]\nspeed_ms = 8", "length_m = 4", ["8", "5", "5", "4.0", "8", "4.0"]),
+        (CUSTOM, "length_m = 4", ["9", "5", "8", "7.2", "8", "4.0"]),
+        (CUSTOM.replace("9.0", "5.0"), "length_m = 4", []),
+    ],
+)
+def test_speeds_of_vehicle_and_route(scenario_folder, vehicle, drive, numbers):
+    """Speeds, then periods and metres of a drive and of one at the route's speed."""
+    (scenario_folder / "car.py").write_text(CAR)
+    text = (scenario_folder / "scenario.toml").read_text()
+    assert "horizon = 4" in text
+    path = scenario_folder / "speeds.toml"
+    path.write_text(text.replace("horizon = 4", drive) + vehicle)
+    scenario, _ = load_scenario(path)
+    found = " ".join(speed_findings(build_world(scenario, scenario.build_policy())))
+    found = found.replace("routes.json", "").replace("'line'", "")
+    assert re.findall(r"\d+(?:\.\d+)?", found) == numbers
+
+
+@pytest.mark.parametrize(
+    ("keys", "vehicle", "named"),
+    [
+        ("", "", []),  # PilotNet's file says it, and so does the vehicle's kind
+        ("control_scale = 2.0", "", ["policy"]),
+        ('control_scale = 2.0\ncontrol_unit = "rad/s"', "", []),
+        ("", CUSTOM, ["vehicle"]),
+        ("control_scale = 2.0", CUSTOM, ["policy", "vehicle"]),
+        ("", f'{CUSTOM}control_unit = "rad/s"', []),
+    ],
+)
+def test_units_that_nothing_says(scenario_folder, keys, vehicle, named):
+    (scenario_folder / "car.py").write_text(CAR)
+    text = (scenario_folder / "scenario.toml").read_text()
+    path = scenario_folder / "units.toml"
+    path.write_text(text.replace("[policy]", f"[policy]\n{keys}") + vehicle)
+    scenario, _ = load_scenario(path)
+    found = list(unit_findings(build_world(scenario, scenario.build_policy())))
+    keys = " and ".join(f"{name}.control_unit" for name in named)
+    assert [line.partition(":")[0] for line in found] == [keys] * bool(named)
