@@ -36,7 +36,7 @@ from mi_nerfattack.render.camera.intrinsics import from_fov
 from mi_nerfattack.rollout.drive import EXPERT, NO_OBJECT, Drive, departure_limits
 from mi_nerfattack.rollout.loop import OnStep
 from mi_nerfattack.scenario.named_file import section_content
-from mi_nerfattack.scenario.policy import AbstractPolicySection
+from mi_nerfattack.scenario.policy.kinds import AbstractPolicySection
 from mi_nerfattack.scenario.vehicle import AbstractVehicleSection
 from mi_nerfattack.system.workers import AbstractWorkers, InThisProcess
 from mi_nerfattack.vehicle.expert import expert_for
@@ -306,9 +306,11 @@ def check_policy(policy: AbstractPolicy, place: Place, routes: Sequence[Route]) 
         InputError: the camera's image or a goal does not fit.
     """
     shape = (1, place.camera.height, place.camera.width, 3)
-    image = mi.TensorXf(np.zeros(shape, np.float32))
+    image, numbers = mi.TensorXf(np.zeros(shape, np.float32)), None
+    if size := policy.numbers.size:
+        numbers = mi.TensorXf(np.zeros((1, size), np.float32))
     for route in routes:
-        policy.step(image, route.goal, policy.initial_memory(1))
+        policy.step(image, route.goal, policy.initial_memory(1), numbers)
 
 
 def _relative(name: str) -> str:

@@ -12,7 +12,7 @@ from mi_nerfattack.errors import InputError
 if TYPE_CHECKING:
     from mi_nerfattack.deploy.place import Place
     from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
-    from mi_nerfattack.scenario.policy import AbstractPolicySection
+    from mi_nerfattack.scenario.policy.kinds import AbstractPolicySection
     from mi_nerfattack.scenario.scenario import Scenario
     from mi_nerfattack.scenario.vehicle import AbstractVehicleSection
 
@@ -51,7 +51,7 @@ class PolicyFile:
         Raises:
             InputError: a key or a section is not usable.
         """
-        from mi_nerfattack.scenario.policy import PolicySection
+        from mi_nerfattack.scenario.policy.kinds import PolicySection
         from mi_nerfattack.scenario.scenario import load_scenario
         from mi_nerfattack.scenario.section import CameraSection, read_section
         from mi_nerfattack.scenario.vehicle import VehicleSection

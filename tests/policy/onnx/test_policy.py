@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from mi_nerfattack.errors import SetupError
-from mi_nerfattack.policy.goals import OneHotGoal
+from mi_nerfattack.policy.inputs import OneHotGoal
 from mi_nerfattack.policy.torch_policy import TorchPolicy
-from mi_nerfattack.scenario.policy import load_policy
+from mi_nerfattack.scenario.policy.kinds import load_policy
 from mi_nerfattack.system.extras import install_hint
 
 onnx = pytest.importorskip("onnx", reason="the extra onnx is not installed")
