@@ -106,7 +106,12 @@ class AbstractPolicySection(Section):
     def action(self) -> Action:
         """Return what the policy's answer means."""
         follower = None if self.trajectory is None else self.trajectory.build()
-        return Action(self.output, self.control_scale, follower)
+        return Action(self.columns, self.control_scale, follower)
+
+    @property
+    def columns(self) -> int | tuple[int, ...] | None:
+        """Columns of the controls in the answer."""
+        return self.output
 
     def given(self, views: Views) -> Inputs:
         """Return what the policy is given; `views` as of :meth:`build`."""
@@ -243,7 +248,22 @@ class ProgramSection(AbstractNetworkSection):
 
     kind: Literal["exported", "torchscript", "onnx"]
     recurrent: Shapes = ()
-    output_name: str | None = None  # of the control, in an ONNX file with several
+    #: Of the control, in an ONNX file with several; or names of several controls.
+    output_name: OneOrSeveral[str] | None = None
+
+    @property
+    def _names(self) -> tuple[str, ...]:
+        """Names of the outputs that are controls."""
+        name = self.output_name or ()
+        return name if isinstance(name, tuple) else (name,)
+
+    @property
+    def columns(self) -> int | tuple[int, ...] | None:
+        """Columns of the controls; several outputs with names are columns."""
+        several = len(self._names)
+        if several > 1 and self.output is None:
+            return tuple(range(several))
+        return self.output
 
     @model_validator(mode="after")
     def _check_output_name(self) -> Any:
@@ -263,7 +283,7 @@ class ProgramSection(AbstractNetworkSection):
             batch = network.batch
         else:
             network = _load_onnx(path)
-            network.choose(self.output_name, len(self.recurrent))
+            network.choose(self._names, len(self.recurrent))
             batch = network.batch
         return self._policy(network, views, batch, self.recurrent)
 
