@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from mi_nerfattack.errors import SetupError
+from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.policy.inputs import OneHotGoal
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.scenario.policy.kinds import load_policy
