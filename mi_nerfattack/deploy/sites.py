@@ -212,7 +212,7 @@ class PlaceSite(AbstractSite):
             "environment": self.name,
             "files": _checksums(paths),
             "camera": to_colmap(place.camera)[1],
-            "mount": asdict(place.mount),
+            "mount": place.mount.described(),
             "car": asdict(place.car),
             "period": place.period,
             "weather": asdict(self.weather),
