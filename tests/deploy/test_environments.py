@@ -99,7 +99,7 @@ def test_every_frame_has_a_seed_of_its_own_that_follows_from_the_drives():
         environment = blank_environment()
         environment.reset(a_route(), None, drive)
         environment.step(0.0)
-        seeds.append(environment.view.seeds)
+        seeds.append(environment.views[0].seeds)
     assert seeds[0] == seeds[1] and len({*seeds[0], *seeds[2]}) == 4
 
 

@@ -137,11 +137,10 @@ def disturbed(
         a tensor like it; differentiable.
     """
     if layout is not None and len(layout.sizes) > 1:
-        draw = exposures, blurs, noise_sd
-        parts = [
-            disturbed(part, *draw, camera_seed(seed, k), step, first)
-            for k, part in enumerate(layout.split(image))
-        ]
+        parts = []
+        for k, part in enumerate(layout.split(image)):
+            own = camera_seed(seed, k)
+            parts.append(disturbed(part, exposures, blurs, noise_sd, own, step, first))
         return side_by_side(parts, layout)
     kind, shape, value = type(image.array), image.shape, image.array
     if exposures.any() or blurs.any():

@@ -102,7 +102,8 @@ def mount_pose(
             mount needs no other kernel.
         forward_m: as in `CameraMount`.
         pitch_deg: like the height.
-        left_m, yaw_deg: as in `CameraMount`.
+        left_m: as in `CameraMount`.
+        yaw_deg: likewise.
 
     Returns:
         origin (`mi.Point3f`) and the columns (right, down, forward) of the rotation

@@ -138,6 +138,21 @@ class Rig:
         """Lay images by name side by side; see :meth:`Layout.join`."""
         return self.layout.join([images[name] for name in self.names], below)
 
+    @property
+    def others(self) -> Rig | None:
+        """All cameras but the first; None where it is alone."""
+        if len(self.names) == 1:
+            return None
+        return Rig(self.names[1:], self.cameras[1:], self.mounts[1:])
+
+    def __add__(self, other: Rig) -> Rig:
+        """Return the cameras of both."""
+        return Rig(
+            self.names + other.names,
+            self.cameras + other.cameras,
+            self.mounts + other.mounts,
+        )
+
     def on(self, mounts: Sequence[CameraMount]) -> Rig:
         """Return the same cameras at other places on the vehicle."""
         return replace(self, mounts=tuple(mounts))

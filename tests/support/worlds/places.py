@@ -24,6 +24,7 @@ from mi_nerfattack.fields.grid import GridField, GridLayout
 from mi_nerfattack.fields.io import save_field
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
+from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.training.settings import CollectSettings
 from mi_nerfattack.vehicle.dynamics import Dubins
@@ -130,7 +131,9 @@ class BlankView(AbstractView):
 def blank_environment(mount: CameraMount | None = None) -> SimulatedEnvironment:
     motion, mount = Motion(Dubins(max_heading_rate=1.5)), mount or CameraMount()
     vehicle = KinematicVehicle(motion, 0.1, 1.5)
-    return SimulatedEnvironment("blank", vehicle, BlankView(), mount, 0.1)
+    view = BlankView()
+    rig = Rig.of_one(view.camera, mount)
+    return SimulatedEnvironment("blank", vehicle, [view], rig, 0.1)
 
 
 KERB_M = 0.12
@@ -177,6 +180,7 @@ class PaintedEnvironment(AbstractEnvironment):
 
     def __init__(self, camera: Camera, conditions: Grey) -> None:
         self.camera, self.conditions = camera, conditions
+        self.rig = Rig.of_one(camera, CameraMount())
         self.states: list[np.ndarray] = []
         self.seen: list[list[PosedField]] = []
         self.seeds: list[int] = []
