@@ -94,6 +94,24 @@ def join_frames(frames: Sequence[CameraFrame], layout: Layout) -> CameraFrame:
     )
 
 
+def first_frame(frame: CameraFrame, layout: Layout) -> CameraFrame:
+    """Return what the first of several cameras sees of a frame; undoes `join_frames`.
+
+    Args:
+        frame: of all.
+        layout: of their images.
+    """
+    if len(layout.sizes) == 1:
+        return frame
+    linear = None if frame.linear is None else layout.split(frame.linear)[0]
+    return CameraFrame(
+        layout.split(frame.image)[0],
+        layout.split(frame.depth[..., None])[0][..., 0],
+        frame.camera_to_world,
+        linear,
+    )
+
+
 def _join_depths(depths: Sequence[np.ndarray], layout: Layout) -> np.ndarray:
     return layout.join([depth[..., None] for depth in depths], np.inf)[..., 0]
 

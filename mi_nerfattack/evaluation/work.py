@@ -33,6 +33,7 @@ from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.io import files
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.render.camera.intrinsics import from_fov
+from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.rollout.drive import EXPERT, NO_OBJECT, Drive, departure_limits
 from mi_nerfattack.rollout.loop import OnStep
 from mi_nerfattack.scenario.named_file import section_content
@@ -211,7 +212,7 @@ class EvaluateDriver(AbstractDriver):
     def _make(self, under: EnvironmentUnder, blind: bool) -> AbstractEnvironment:
         place, conditions = self._place, under.conditions
         if blind:
-            place = replace(place, camera=_EXPERT_CAMERA)
+            place = place.with_rig(Rig.of_one(_EXPERT_CAMERA, place.mount))
             conditions = replace(conditions, spp=1)
         return make_environment(under.name, place, conditions)
 
@@ -305,7 +306,8 @@ def check_policy(policy: AbstractPolicy, place: Place, routes: Sequence[Route]) 
     Raises:
         InputError: the camera's image or a goal does not fit.
     """
-    shape = (1, place.camera.height, place.camera.width, 3)
+    width, height = place.rig.size
+    shape = (1, height, width, 3)
     image = mi.TensorXf(np.zeros(shape, np.float32))
     for route in routes:
         policy.step(image, route.goal, policy.initial_memory(1))

@@ -239,8 +239,8 @@ class PaintedSite(AbstractSite):
     opened: list[PaintedEnvironment] = field(default_factory=list, compare=False)
 
     @property
-    def camera(self) -> Camera:
-        return from_fov(*self.size_px, 90.0)
+    def rig(self) -> Rig:
+        return Rig.of_one(from_fov(*self.size_px, 90.0), CameraMount())
 
     @property
     def car(self) -> Car:
@@ -257,7 +257,7 @@ class PaintedSite(AbstractSite):
         return Grey()
 
     def open(self, conditions):
-        self.opened.append(PaintedEnvironment(self.camera, conditions))
+        self.opened.append(PaintedEnvironment(self.rig.cameras[0], conditions))
         self.opened[-1].name = self.name
         return self.opened[-1]
 
