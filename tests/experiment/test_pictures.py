@@ -27,6 +27,7 @@ from mi_nerfattack.io import files
 from mi_nerfattack.io.exr import read_layers, read_metadata
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
+from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.report.plots.strip import GAP_PX, TILE_PX
 from mi_nerfattack.rollout.drive import CASES, Drive
 from mi_nerfattack.rollout.objective import StateHistory

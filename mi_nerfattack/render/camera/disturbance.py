@@ -166,20 +166,20 @@ def side_by_side(images: Sequence[Any], layout: Layout) -> Any:
         layout: of the frame.
     """
     width, height = layout.size
-    kind = type(images[0])
+    kind = type(images[0].array)
     shape = (images[0].shape[0], height, width, 3)
-    index = dr.arange(dr.uint32_array_t(kind.Array), math.prod(shape))
+    index = dr.arange(dr.uint32_array_t(kind), math.prod(shape))
     pixel, channel = index // 3, index % 3
     row, column = pixel // width, pixel % width
     image, row = row // height, row % height
-    frame = dr.zeros(kind.Array, math.prod(shape))
+    frame = dr.zeros(kind, math.prod(shape))
     for part, columns, (wide, high) in zip(
         images, layout.columns, layout.sizes, strict=True
     ):
         inside = (column >= columns.start) & (column < columns.stop) & (row < high)
         source = ((image * high + row) * wide + column - columns.start) * 3 + channel
-        frame += dr.gather(kind.Array, part.array, source, inside)
-    return kind(frame, shape)
+        frame += dr.gather(kind, part.array, source, inside)
+    return type(images[0])(frame, shape)
 
 
 def blur(value: Any, shape: tuple[int, ...], blurs: np.ndarray) -> Any:
