@@ -34,7 +34,7 @@ def several(place: Place) -> Place:
 
 
 def objects() -> list[PosedField]:
-    field = blob(np.random.default_rng(1))
+    field = blob(np.random.default_rng(1), peak=12.0)
     return [PosedField(field, Pose.upright((4.0, 3.0, 1.0), 0.3, 1.0))]
 
 
