@@ -125,8 +125,14 @@ def mount_pose(
         py + ahead * sin_theta + left * cos_theta,
         height,
     )
-    # The optical axis: the vehicle's heading, turned to the left
-    sin_theta, cos_theta = dr.sincos(theta + dr.opaque(mi.Float, math.radians(yaw_deg)))
+    # The optical axis: the vehicle's heading turned to the left, by a sum of angles that
+    # leaves values and derivatives as they are, to the last bit, where nothing is turned
+    yaw = math.radians(yaw_deg)
+    sin_yaw, cos_yaw = (dr.opaque(mi.Float, f(yaw)) for f in (math.sin, math.cos))
+    sin_theta, cos_theta = (
+        sin_theta * cos_yaw + cos_theta * sin_yaw,
+        cos_theta * cos_yaw - sin_theta * sin_yaw,
+    )
     right = mi.Vector3f(sin_theta, -cos_theta, 0)
     down = mi.Vector3f(-cos_theta * sin_pitch, -sin_theta * sin_pitch, -cos_pitch)
     forward = mi.Vector3f(cos_theta * cos_pitch, sin_theta * cos_pitch, -sin_pitch)
