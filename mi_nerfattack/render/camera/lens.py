@@ -125,8 +125,8 @@ def mount_pose(
         py + ahead * sin_theta + left * cos_theta,
         height,
     )
-    # The optical axis: the vehicle's heading turned to the left, by a sum of angles that
-    # leaves values and derivatives as they are, to the last bit, where nothing is turned
+    # The optical axis: the vehicle's heading turned to the left, by a sum of angles
+    # that changes no bit of values and derivatives where the turn is 0
     yaw = math.radians(yaw_deg)
     sin_yaw, cos_yaw = (dr.opaque(mi.Float, f(yaw)) for f in (math.sin, math.cos))
     sin_theta, cos_theta = (
