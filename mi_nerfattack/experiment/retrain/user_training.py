@@ -198,12 +198,13 @@ class _Output:
 
     def _follow(self) -> None:
         decode = codecs.getincrementaldecoder("utf-8")("replace").decode
-        while raw := os.read(self._stream.fileno(), 1 << 16):
-            text = decode(raw)
-            self._text = (self._text + text)[-_LAST_CHARACTERS:]
-            if sys.stderr is not None:
-                sys.stderr.write(text)
-                sys.stderr.flush()
+        with self._stream:
+            while raw := os.read(self._stream.fileno(), 1 << 16):
+                text = decode(raw)
+                self._text = (self._text + text)[-_LAST_CHARACTERS:]
+                if sys.stderr is not None:
+                    sys.stderr.write(text)
+                    sys.stderr.flush()
 
     def end(self) -> None:
         """Wait for the end, which a process that goes on in the background delays."""
