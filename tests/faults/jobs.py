@@ -184,7 +184,7 @@ JOBS = {
         places=2,
         slow=True,
     ),
-    "retrain by your own module": Job(
+    "retrain by a module": Job(
         "retrain run",
         "-o new.safetensors --data data --module mine.py:train --trust-code --runs 1 "
         "--frames surrogate 64 --exposures-ev 0 --environments surrogate",
