@@ -99,12 +99,11 @@ def read_keys(path: Path) -> dict[str, Any]:
     if list(found) != ["policy"]:
         there = ", ".join(found) or "nothing"
         raise InputError(f"{path}: has {there}; a section [policy] alone is needed")
-    keys = dict(found["policy"])
+    keys = found["policy"]
     section = read_section(f"{path}: policy", PolicySection, keys, path.parent)
-    for name in type(section).model_fields:
-        if isinstance(value := getattr(section, name), NamedFile):
-            keys[name] = value.portable
-    return keys
+    named = {name: getattr(section, name) for name in type(section).model_fields}
+    named = {k: v.portable for k, v in named.items() if isinstance(v, NamedFile)}
+    return {**keys, **named}
 
 
 def try_policy(found: FoundAttack, setting: str, attacked_again: bool) -> str:

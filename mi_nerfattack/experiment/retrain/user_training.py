@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import codecs
 import os
 import re
 import shlex
 import shutil
-import signal
-import subprocess
-import sys
-import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, ClassVar
+from typing import Any, ClassVar
 
 from mi_nerfattack.errors import InputError, is_interrupt
+from mi_nerfattack.experiment.retrain.shown_process import ending, run_shown
 from mi_nerfattack.io import files
 from mi_nerfattack.io.locks import exclusive
 from mi_nerfattack.io.resumable import json_digest
@@ -34,9 +29,6 @@ PLACEHOLDERS = {
 }
 _NEEDED = ("data", "out")
 _BRACES = re.compile(r"\{(\w*)\}")
-_LAST_LINES, _LAST_CHARACTERS = 12, 4000
-#: Seconds that an interrupted command has to save what it wants to.
-GRACE_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -161,85 +153,13 @@ class CommandTraining(AbstractUserTraining):
         words, threads = self._filled(order), str(order.threads)
         # without the latter, output that is no terminal's comes late
         own = {"OMP_NUM_THREADS": threads} | os.environ | {"PYTHONUNBUFFERED": "1"}
-        with files.reported(words[0]):
-            process = subprocess.Popen(
-                words,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                env=own,
-                start_new_session=True,  # Ctrl-C is for us; we pass it on
-                pass_fds=() if lock is None else (lock,),  # also if we are killed
-            )
-        assert process.stdout is not None
-        output = _Output(process.stdout)
-        try:
-            status = process.wait()
-        except BaseException:
-            _interrupt(process)
-            raise
-        finally:
-            output.end()
+        status, last = run_shown(words, own, () if lock is None else (lock,))
         if status:
             raise InputError(
-                f"{self.option}: {shlex.join(words)} {_ending(status)}:\n"
-                f"{output.last()}\ncorrect it, and give the same command again; the "
-                f"frames in {order.data} are kept"
+                f"{self.option}: {shlex.join(words)} {ending(status)}:\n{last}\n"
+                "correct it, and give the same command again; the frames in "
+                f"{order.data} are kept"
             )
-
-
-class _Output:
-    """Shows the output of a process as it comes, and keeps its end."""
-
-    def __init__(self, stream: IO[bytes]) -> None:
-        self._stream, self._text = stream, ""
-        self._thread = threading.Thread(target=self._follow, daemon=True)
-        self._thread.start()
-
-    def _follow(self) -> None:
-        decode = codecs.getincrementaldecoder("utf-8")("replace").decode
-        with self._stream:
-            while raw := os.read(self._stream.fileno(), 1 << 16):
-                text = decode(raw)
-                self._text = (self._text + text)[-_LAST_CHARACTERS:]
-                if sys.stderr is not None:
-                    sys.stderr.write(text)
-                    sys.stderr.flush()
-
-    def end(self) -> None:
-        """Wait for the end, which a process that goes on in the background delays."""
-        self._thread.join(1.0)
-
-    def last(self) -> str:
-        """Return the last lines."""
-        lines = [line for line in self._text.splitlines() if line.strip()]
-        return "\n".join(f"  {line}" for line in lines[-_LAST_LINES:]) or "  (nothing)"
-
-
-def _interrupt(process: subprocess.Popen[bytes]) -> None:
-    """Send Ctrl-C to a process and its children, and kill them if it is no use."""
-    try:
-        _send(process, signal.SIGINT)
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(GRACE_S)
-    finally:
-        _send(process, getattr(signal, "SIGKILL", signal.SIGTERM))
-        process.wait()
-
-
-def _send(process: subprocess.Popen[bytes], number: int) -> None:
-    with suppress(ProcessLookupError, PermissionError):
-        if os.name == "posix":
-            os.killpg(process.pid, number)  # its own group, also after its end
-        else:
-            process.terminate()
-
-
-def _ending(status: int) -> str:
-    if status < 0:
-        with suppress(ValueError):
-            return f"was ended by {signal.Signals(-status).name}"
-    return f"ended with exit status {status}"
 
 
 @dataclass(frozen=True)
@@ -354,7 +274,7 @@ def train_once(
         "frames_sha256": json_digest([files.sha256(path) for path in shards]),
     }
     with exclusive(folder) as lock:
-        if _done(folder, order.out.name, check) == about:
+        if _is_done(folder, order.out.name, about, check):
             return about
         for path in (folder / DONE, order.out):
             with files.reported(path):
@@ -380,12 +300,12 @@ def train_once(
 DONE = "done.json"
 
 
-def _done(folder: Path, name: str, check: Callable[[], str]) -> Any:
-    """Return what was done, if the file that came of it is still there."""
+def _is_done(
+    folder: Path, name: str, about: Mapping[str, Any], check: Callable[[], str]
+) -> bool:
+    """Whether a training was done, and the file that came of it is still there."""
     try:
         kept = files.read_json(folder / DONE)
-        if (kept["file"], kept["policy"]) == (name, check()):
-            return kept["about"]
-    except (InputError, KeyError, TypeError):  # nothing yet, or no longer usable
-        pass
-    return None
+        return kept == {"about": about, "file": name, "policy": check()}
+    except InputError:  # nothing was done yet, or it is no longer usable
+        return False

@@ -15,7 +15,7 @@ import pytest
 from support.faults.refusals import refusals
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.experiment.retrain import user_training
+from mi_nerfattack.experiment.retrain import shown_process
 from mi_nerfattack.experiment.retrain.user_training import (
     CommandTraining,
     ModuleTraining,
@@ -223,7 +223,7 @@ def test_an_interrupt_reaches_the_command_which_can_save(tmp_path):
 
 
 def test_a_command_that_does_not_hear_is_killed(tmp_path, monkeypatch):
-    monkeypatch.setattr(user_training, "GRACE_S", 0.2)
+    monkeypatch.setattr(shown_process, "GRACE_S", 0.2)
     order = interrupted(tmp_path, DEAF)
     with locks.exclusive(order.out.parent):  # nobody has it any longer
         assert not order.out.with_name("checkpoint").exists()
