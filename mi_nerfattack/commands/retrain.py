@@ -40,11 +40,11 @@ class Retrain:
 
     Drives past the attacks, and past those held out; collects frames among the
     attacked objects, labelled by the expert; trains the policy further on them and on
-    those that it was trained on (--more), or lets --command train it; and drives again.
-    Only runs count whose scenario the expert itself can drive. Stopped, it continues
-    from DATA, and so it does with more --held-out or --adaptive, without training
-    again. Beside the policy come its program, its record as 'train' writes it, and
-    NAME-retrain.json: the runs, and errors before and after.
+    older ones (--more), or lets --command train it; and drives again. Only runs count
+    whose scenario the expert itself can drive. Stopped, it continues from DATA, and so
+    it does with more --held-out or --adaptive, without training again. Beside the
+    policy come NAME-retrain.json, the runs and errors before and after, and of our
+    training its program and record.
     """
 
     continues: ClassVar[bool] = True
@@ -54,23 +54,22 @@ class Retrain:
     ]
     """Folders of finished runs of attack, on one policy, in one place."""
     output: Path
-    """Policy file to write; .safetensors without --command."""
+    """Policy file to write, of the kind of the old one."""
     data: Path
     """Folder of new frames and checkpoints; made if missing."""
     command: str | None = None
-    """Your training instead of ours: "python my.py {data} {out}"; {policy}, {seed} and
-    {threads} are known, too."""
+    """Your training, such as "python my.py {data} {out}"; there are {policy}, {seed}
+    and {threads}, too."""
     module: str | None = None
-    """Likewise FILE.py:NAME, a function of data, out and seed."""
+    """FILE.py:NAME, a function of data, out and seed, instead."""
     trust_code: bool = False
-    """Run the code of --module, with all rights of your account."""
+    """Run code of --module with all rights of your account."""
     more: tuple[Path, ...] = ()
     """Folders of frames that the policy was trained on; without them it forgets."""
     held_out: tuple[Path, ...] = ()
-    """Runs on the same policy to drive before and after, and not to train on."""
+    """Runs to drive before and after, and not to train on."""
     frames: dict[str, int] | None = None
-    """New frames by environment; surrogate 2048 mitsuba 3072 by default, half of the
-    preset laptop of 'train'."""
+    """New frames by environment: surrogate 2048 mitsuba 3072."""
     skies: tuple[str, ...] = ("day",)
     """Times of day of rendered frames; others than day need a sunsky emitter."""
     exposures_ev: tuple[float, ...] = (-1.0, -0.5, 0.0, 0.5, 1.0)
@@ -91,14 +90,13 @@ class Retrain:
     """Drives before and after of each case: past an attack, and without objects."""
     adaptive: bool = False
     """Attack the new policy in the same scenarios, too, which takes as long as the
-    runs did, and drive past what that finds."""
+    runs did."""
     workers: int | None = None
     """Processes that collect and drive; one a core by default, 1 works in this one."""
     seed: int = 0
     """Of all random numbers."""
     json: bool = False
-    """End with one line of JSON in place of the tables: the content of
-    NAME-retrain.json, and the policy's card."""
+    """End with one line of JSON: NAME-retrain.json and the card."""
 
     def run(self) -> Result:
         """Check, collect, train, drive and write."""
