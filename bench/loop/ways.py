@@ -20,7 +20,7 @@ import torch
 from bench.worker import Clock
 from mi_nerfattack.deploy.surrogate.scene import scene_sensor
 from mi_nerfattack.policy.drjit_network import DrJitNetwork
-from mi_nerfattack.policy.goals import NoGoal
+from mi_nerfattack.policy.inputs import NoGoal
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.camera.intrinsics import CameraMount
 from mi_nerfattack.rollout.adjoint import KeptBackgrounds, Replay

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import drjit as dr
@@ -27,6 +28,14 @@ def to_tensor(value: torch.Tensor, like: Any) -> Any:
 def to_row(value: torch.Tensor, like: Any) -> Any:
     """Make a Dr.Jit row (n,) of the scalar type and backend of the tensor `like`."""
     return dr.array_t(like)(_settled(value, like))
+
+
+def to_controls(value: torch.Tensor, like: Any) -> Any:
+    """Make a row (n,) of controls (n,), k rows (k, n) of controls (n, k)."""
+    if value.ndim == 1:
+        return to_row(value, like)
+    kind: Any = sys.modules[type(like).__module__].ArrayXf
+    return kind(*(to_row(column, like) for column in value.unbind(1)))
 
 
 def _settled(value: torch.Tensor, like: Any) -> Any:

@@ -118,7 +118,7 @@ class DriveCommand:
             from mi_nerfattack import variant
 
             variant.ensure()
-            policy = file.section.build()
+            policy = file.section.build(file.views)
             unit, wheelbase_m = file.control()
         config = config.driven_by(unit, wheelbase_m)
         if rig is None:

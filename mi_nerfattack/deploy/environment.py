@@ -13,10 +13,13 @@ import numpy as np
 
 from mi_nerfattack.backend.arrays import aligned
 from mi_nerfattack.backend.colour import srgb_to_linear_numpy
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.render.camera.rig import Layout, Rig
 from mi_nerfattack.rollout.drive import Drive
+from mi_nerfattack.rollout.loop import numbers_of, stacked
+from mi_nerfattack.vehicle.dynamics import to_state
 from mi_nerfattack.vehicle.route.route import Route
 
 
@@ -197,6 +200,17 @@ class AbstractEnvironment(ABC):
         """
 
     @property
+    def speed(self) -> float:
+        """Speed along the heading, metres per second.
+
+        Raises:
+            InputError: the environment does not measure it.
+        """
+        raise InputError(
+            f"environment {self.name!r}: it knows no speed, which the policy is told"
+        )
+
+    @property
     def is_over(self) -> bool:
         """Whether there is nothing more to observe, as at the end of a recording."""
         return False
@@ -279,7 +293,9 @@ def drive(
     memory = policy.initial_memory(1)
     states, controls = [environment.state], []
     for index in range(steps):
-        row, memory = policy.step(policy_image(frame.image), route.goal, memory)
+        image = policy_image(frame.image)
+        numbers = told(policy, environment, route, index)
+        row, memory = policy.step(image, route.goal, memory, numbers)
         controls.append(float(np.array(row)[0]))
         frame = environment.step(controls[-1])
         states.append(environment.state)
@@ -298,6 +314,29 @@ def drive(
         cross_track_m=route.cross_track_numpy(np.stack(states[1:])),
         time_s=environment.period * np.arange(1, len(controls) + 1),
     )
+
+
+def told(
+    policy: AbstractPolicy, environment: AbstractEnvironment, route: Route, step: int
+) -> Any:
+    """Return what a policy is told besides the image, (1, k); None for nothing.
+
+    Args:
+        policy: that asks.
+        environment: in which it drives.
+        route: that it is told points of.
+        step: control periods since the start.
+
+    Raises:
+        InputError: the environment does not know it.
+    """
+    if not policy.numbers:
+        return None
+    state, row = to_state(environment.state[None]), None
+    if policy.numbers.speed:
+        row = to_state(np.full((1, 3), environment.speed))[0]  # opaque
+    time = step * environment.period
+    return stacked(numbers_of(policy.numbers, state, row, time, route))
 
 
 def policy_image(image: np.ndarray) -> mi.TensorXf:

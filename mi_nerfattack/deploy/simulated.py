@@ -75,6 +75,11 @@ class AbstractSimulation(AbstractEnvironment):
         """State (m,) of the vehicle."""
         return self.vehicle.state
 
+    @property
+    def speed(self) -> float:
+        """Speed of the vehicle."""
+        return self.vehicle.speed
+
     def _disturbed(self, frame: CameraFrame) -> CameraFrame:
         """Blur the image of a frame and add noise, in eight bits."""
         if not (self.blur_px or self.noise_sd):

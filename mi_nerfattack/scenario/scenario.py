@@ -36,10 +36,9 @@ from mi_nerfattack.scenario.deployment import (
 from mi_nerfattack.scenario.named_file import File, NamedFile, portable_text
 from mi_nerfattack.scenario.objective import ObjectiveSection
 from mi_nerfattack.scenario.objects import FieldObjectSection, ObjectSection, Triple
-from mi_nerfattack.scenario.policy import PolicySection, build_differentiable
+from mi_nerfattack.scenario.policy.kinds import PolicySection, build_differentiable
 from mi_nerfattack.scenario.section import (
     CameraSection,
-    Later,
     NamedCameraSection,
     Section,
     misfit,
@@ -196,7 +195,7 @@ class Scenario(Section):
     objects: Annotated[tuple[ObjectSection, ...], Field(min_length=1)]
     policy: PolicySection
     camera: CameraSection = CameraSection()
-    cameras: Annotated[tuple[NamedCameraSection, ...], Later()] = ()  # or several
+    cameras: tuple[NamedCameraSection, ...] = ()  # or several
     vehicle: VehicleSection = DubinsSection()
     drive: DriveSection = DriveSection()
     objective: ObjectiveSection = ObjectiveSection()
@@ -223,8 +222,8 @@ class Scenario(Section):
                 which it does not have.
         """
         if self.attack.method.needs_derivatives:
-            return build_differentiable(self.policy)
-        return self.policy.build()
+            return build_differentiable(self.policy, self.rig().views)
+        return self.policy.build(self.rig().views)
 
     @model_validator(mode="after")
     def _check_sections(self) -> Any:

@@ -18,6 +18,7 @@ from typing import (
     ClassVar,
     Literal,
     NoReturn,
+    TypeVar,
     get_args,
     get_type_hints,
 )
@@ -25,15 +26,16 @@ from typing import (
 from pydantic import (
     BaseModel,
     ConfigDict,
+    Discriminator,
     Field,
     GetCoreSchemaHandler,
     GetJsonSchemaHandler,
+    Tag,
     TypeAdapter,
     ValidationError,
     WrapValidator,
     model_validator,
 )
-from pydantic.fields import FieldInfo
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import (
     CoreSchema,
@@ -49,11 +51,6 @@ from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
 from mi_nerfattack.render.camera.rig import Rig
 
 Trust = Annotated[bool, Field(exclude=True)]  # results do not depend on it
-
-
-@dataclass(frozen=True)
-class Later:
-    """Mark a key that came after results had identities: its default is left out."""
 
 
 #: Of a control: a heading rate, a steering angle, or another quantity.
@@ -74,6 +71,8 @@ class Section(BaseModel):
     model_config: ClassVar[ConfigDict] = ConfigDict(
         extra="forbid", frozen=True, strict=True
     )
+    #: Keys that do not count at their defaults: digests from before them stay.
+    later: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def defaults(cls) -> dict[str, Any]:
@@ -169,6 +168,16 @@ class Kinds:
         return _reworded(lambda: read(data), reword)
 
 
+_T = TypeVar("_T")
+#: A value, or an array of such.
+OneOrSeveral = Annotated[
+    Annotated[_T, Tag("one")]
+    | Annotated[tuple[_T, ...], Field(min_length=1), Tag("several")],
+    Discriminator(lambda value: "several" if isinstance(value, tuple) else "one"),
+    UNTAGGED,
+]
+
+
 def refuse(key: str, reason: str) -> NoReturn:
     """Raise an error of a key that a check of the whole section found."""
     way = tuple(int(part) if part.isdigit() else part for part in key.split("."))
@@ -252,13 +261,9 @@ def problems(err: ValidationError) -> Iterator[tuple[Location, str]]:
 def _leaves(location: Location, value: Any) -> Iterator[tuple[Location, Any]]:
     inner: list[tuple[str | int, Any]]
     if isinstance(value, Section):
-        keys = type(value).model_fields.items()
-        inner = [
-            (key, item)
-            for key, field in keys
-            if not field.exclude
-            and ((item := getattr(value, key)) != field.default or not _is_later(field))
-        ]
+        keys, usual = type(value).model_fields.items(), value.defaults()
+        inner = [(k, getattr(value, k)) for k, field in keys if not field.exclude]
+        inner = [(k, v) for k, v in inner if k not in value.later or v != usual[k]]
     elif is_dataclass(value) and hasattr(value, "kind"):
         inner = list(vars(value).items())
     elif isinstance(value, tuple) and value and isinstance(value[0], Section):
@@ -268,10 +273,6 @@ def _leaves(location: Location, value: Any) -> Iterator[tuple[Location, Any]]:
         return
     for key, item in inner:
         yield from _leaves((*location, key), item)
-
-
-def _is_later(field: FieldInfo) -> bool:
-    return any(isinstance(mark, Later) for mark in field.metadata)
 
 
 def _frozen(value: Any) -> Any:
@@ -314,8 +315,9 @@ class AbstractCameraSection(Section):
     height_m: Positive = 1.4
     forward_m: Finite = 0.5
     pitch_deg: Annotated[float, Field(gt=-90, lt=90)] = 6.0
-    left_m: Annotated[Finite, Later()] = 0.0
-    yaw_deg: Annotated[Turn, Later()] = 0.0  # to the left
+    left_m: Finite = 0.0
+    yaw_deg: Turn = 0.0  # to the left
+    later: ClassVar[tuple[str, ...]] = ("left_m", "yaw_deg")
     lens: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
     def build(self) -> tuple[Camera, CameraMount]:

@@ -108,6 +108,7 @@ class World:
             self.scenario.vehicle.dt_s,
             motion.substeps,
             motion.delay,
+            route=self.route,
         )
 
     @property

@@ -138,6 +138,15 @@ class AbstractDynamics(ABC):
     def saturate(self, control: Any) -> Any:
         """Limit a commanded control (n,) smoothly to what the vehicle can do."""
 
+    def speed_of(self, state: Any) -> Any:
+        """Return speeds (n,) along the headings of states (m, n), m/s; signed.
+
+        Differentiable; with the control 0, which moves no vehicle at once.
+        """
+        slope = self.derivative(state, dr.zeros(type(state[0]), dr.width(state)))
+        sin, cos = dr.sincos(state[2])
+        return slope[0] * cos + slope[1] * sin
+
     def numbered(self, first: int) -> AbstractDynamics:
         """Return this model with another number of the first drive of each batch.
 

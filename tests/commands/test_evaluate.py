@@ -25,7 +25,7 @@ from mi_nerfattack.evaluation import work as evaluate_work
 from mi_nerfattack.fields.io import save_field
 from mi_nerfattack.io import files
 from mi_nerfattack.report.pages.policy import policy_name, summary
-from mi_nerfattack.scenario.policy import HttpSection, ProgramSection
+from mi_nerfattack.scenario.policy.kinds import HttpSection, ProgramSection
 from mi_nerfattack.scenes import bundled
 from mi_nerfattack.system.workers import InThisProcess, Processes
 

@@ -12,7 +12,7 @@ from mi_nerfattack.errors import InputError
 if TYPE_CHECKING:
     from mi_nerfattack.deploy.place import Place
     from mi_nerfattack.render.camera.rig import Rig
-    from mi_nerfattack.scenario.policy import AbstractPolicySection
+    from mi_nerfattack.scenario.policy.kinds import AbstractPolicySection
     from mi_nerfattack.scenario.scenario import Scenario
     from mi_nerfattack.scenario.vehicle import AbstractVehicleSection
 
@@ -38,6 +38,11 @@ class PolicyFile:
     vehicle: AbstractVehicleSection | None = None
     scenario: Scenario | None = None
 
+    @property
+    def views(self) -> dict[str, tuple[slice, slice]]:
+        """Rows and columns of the cameras' images in a frame, see `Rig.views`."""
+        return {} if self.rig is None else self.rig.views
+
     @classmethod
     def read(cls, policy: str | None, settings: Sequence[str] = ()) -> PolicyFile:
         """Read a policy.
@@ -51,7 +56,7 @@ class PolicyFile:
         Raises:
             InputError: a key or a section is not usable.
         """
-        from mi_nerfattack.scenario.policy import PolicySection
+        from mi_nerfattack.scenario.policy.kinds import PolicySection
         from mi_nerfattack.scenario.scenario import load_scenario
         from mi_nerfattack.scenario.section import (
             CameraSection,

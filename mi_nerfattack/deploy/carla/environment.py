@@ -129,6 +129,11 @@ class CarlaEnvironment(AbstractEnvironment):
             raise InputError("environment 'carla': it has a state only after reset")
         return self.driver.vehicle.state
 
+    @property
+    def speed(self) -> float:
+        """Speed of the model."""
+        return self.driver.vehicle.speed
+
     def show(self, objects: Sequence[Any]) -> None:
         """Paste fields by depth."""
         self._paster = Paster(self.camera, objects)

@@ -98,6 +98,16 @@ class ReplayEnvironment(AbstractEnvironment):
         return self._states[self._index].copy()
 
     @property
+    def speed(self) -> float:
+        """Speed between the frames before and after, along the heading."""
+        track, last = self.recording.track, len(self._states) - 1
+        before, after = max(self._index - 1, 0), min(self._index + 1, last)
+        moved = self._states[after, :2] - self._states[before, :2]
+        heading = self.state[2]
+        along = moved @ np.array([math.cos(heading), math.sin(heading)])
+        return float(along / (track.times[after] - track.times[before]))
+
+    @property
     def is_over(self) -> bool:
         """Whether the next step would lie beyond the last frame."""
         end = float(self.recording.track.times[-1]) + 0.5 * self.period

@@ -50,6 +50,11 @@ class AbstractAround(AbstractEnvironment):
         return self.inside.state
 
     @property
+    def speed(self) -> float:
+        """Speed of the vehicle, as it is."""
+        return self.inside.speed
+
+    @property
     def is_over(self) -> bool:
         """Whether there is nothing more to observe."""
         return self.inside.is_over

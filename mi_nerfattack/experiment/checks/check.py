@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.deploy.environment import (
@@ -107,8 +106,11 @@ class Check:
 
     def _slope(self, frame: CameraFrame) -> None:
         """Look whether the control has a derivative by the first image."""
-        image, goal = policy_image(frame.image), self.world.route.goal
-        _, d_image = self.world.policy.vjp(image, goal, mi.Float(1))
+        policy, loop = self.world.policy, self.world.loop(self.world.surrogate)
+        numbers = loop.numbers(loop.initial(self.world.initial[:1]), 0)
+        given = policy_image(frame.image), loop.goal, policy.initial_memory(1)
+        control, _ = policy.step(*given, numbers)
+        d_image, *_ = policy.step_vjp(*given, 0 * control + 1, (), numbers)
         if not d_image.numpy().any():
             self.doubts.append(
                 "the derivative of the policy's control by the first image is exactly "

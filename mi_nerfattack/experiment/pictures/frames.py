@@ -20,6 +20,7 @@ from mi_nerfattack.deploy.environment import (
     AbstractEnvironment,
     CameraFrame,
     policy_image,
+    told,
 )
 from mi_nerfattack.deploy.surrogate.environment import SurrogateEnvironment
 from mi_nerfattack.evaluation.metrics import environment_order
@@ -259,7 +260,9 @@ class Film:
             shown = frame if step in wanted else None
             yield Moment(step, self.environment.state, memory, shown)
             if watched:
-                _, memory = policy.step(policy_image(frame.image), route.goal, memory)
+                numbers = told(policy, self.environment, route, step)
+                image = policy_image(frame.image)
+                _, memory = policy.step(image, route.goal, memory, numbers)
 
     def cost_by_image(self, steps: Sequence[int]) -> dict[int, np.ndarray]:
         """Differentiate the objective of the drive by its images.

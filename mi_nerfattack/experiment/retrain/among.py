@@ -18,7 +18,7 @@ from mi_nerfattack.fields.io import holds_splats
 from mi_nerfattack.io.resumable import differences, flatten, refuse
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.scenario.named_file import section_content
-from mi_nerfattack.scenario.policy import PilotNetSection
+from mi_nerfattack.scenario.policy.kinds import PilotNetSection
 from mi_nerfattack.scenario.scenario import is_within
 from mi_nerfattack.scenario.world import place_of
 from mi_nerfattack.training.settings import CollectSettings

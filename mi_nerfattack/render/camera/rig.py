@@ -130,6 +130,15 @@ class Rig:
         """The columns of each image in a frame, by name."""
         return dict(zip(self.names, self.layout.columns, strict=True))
 
+    @property
+    def views(self) -> dict[str, tuple[slice, slice]]:
+        """Rows and columns of each named image; none of an only camera without name."""
+        if self.names == (ONLY,):
+            return {}
+        rows = (slice(0, camera.height) for camera in self.cameras)
+        places = zip(rows, self.layout.columns, strict=True)
+        return dict(zip(self.names, places, strict=True))
+
     def split(self, frame: Any) -> dict[str, Any]:
         """Return the images of a frame by name; see :meth:`Layout.split`."""
         return dict(zip(self.names, self.layout.split(frame), strict=True))

@@ -15,6 +15,7 @@ from torch import nn
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io.network import Endpoint, read_token
+from mi_nerfattack.policy.action import Action
 from mi_nerfattack.policy.http import server as http_server
 from mi_nerfattack.policy.http.client import PolicyClient
 from mi_nerfattack.policy.http.server import PolicyServer
@@ -146,7 +147,7 @@ test_other_computers_need_a_token = refusals(
 
 
 def test_what_the_policy_says_of_an_image():
-    broken = TorchPolicy(Sum(), recurrent=[(-1, 1)], control_scale=float("inf"))
+    broken = TorchPolicy(Sum(), recurrent=[(-1, 1)], action=Action(scale=float("inf")))
     with serving() as (_, url), serving(broken) as (_, other):
         client = PolicyClient(url, TOKEN, retries=0)
         with pytest.raises(InputError, match="status 422 .*too bright by"):
