@@ -109,7 +109,7 @@ def test_each_drive_has_its_own_vehicle(model):
     control = type(start[0])([0.3, -0.2, 0.1])
     found = np.array(vehicle.derivative(start, control))
     for k in range(3):
-        own = {"speed": model.speed * drawn.speed[k]}
+        own = {"speed_ms": model.speed_ms * drawn.speed[k]}
         if rows > 3 or isinstance(model, Ackermann):
             own["wheelbase"] = model.wheelbase / drawn.steering[k]
         expected = np.array(replace(model, **own).derivative(start, control))[:, k]
