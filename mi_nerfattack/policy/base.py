@@ -52,7 +52,7 @@ class AbstractPolicy(ABC):
                 steps one after the other: each row of a batch stands for itself.
             goal: as given to `step`.
             memory: likewise.
-            cotangent: row (n,), derivative of the objective by the control.
+            cotangent: (n,) or (k, n), derivative of the objective by the control.
             d_memory: derivative of the objective by the memory that `step`
                 returned, of its structure; ``()`` after the last step.
 
@@ -86,7 +86,9 @@ class AbstractPolicy(ABC):
             goal: an integer, or one for each image.
 
         Returns:
-            Row (n,), evaluated and detached, in the unit of the vehicle's control.
+            The control of each image, a row (n,), in the unit of the vehicle's; of a
+            vehicle with k > 1 controls an array of k rows (k, n), such as `ArrayXf`.
+            Evaluated and detached.
         """
 
     @abstractmethod
@@ -96,9 +98,9 @@ class AbstractPolicy(ABC):
         Args:
             image: as for `control`.
             goal: as for `control`.
-            cotangent: row (n,), derivative of the objective by the control.
+            cotangent: (n,) or (k, n), derivative of the objective by the control.
 
         Returns:
-            The control (n,), and the derivative of the objective by the image, a
+            The control, and the derivative of the objective by the image, a
             tensor of the image's shape; both evaluated and detached.
         """

@@ -9,10 +9,17 @@ from typing import Any, ClassVar, NoReturn
 import numpy as np
 import torch
 
-from mi_nerfattack.backend.torch_arrays import to_row, to_torch
+from mi_nerfattack.backend.torch_arrays import to_controls, to_torch
 from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.policy.base import AbstractPolicy, Memory
-from mi_nerfattack.policy.checks import check_images, expand_goals, steering
+from mi_nerfattack.policy.checks import (
+    Output,
+    Scale,
+    check_images,
+    chosen_controls,
+    expand_goals,
+    scaled,
+)
 from mi_nerfattack.policy.preprocess import Preprocess
 
 DIFFERENTIABLE_KINDS = "pilotnet, module, exported, torchscript, onnx, drjit"
@@ -26,8 +33,10 @@ class AbstractBlackBox(AbstractPolicy):
 
     Args:
         preprocess: from the camera's image to the policy's.
-        control_scale: factor from the policy's unit and sign to the vehicle's.
-        output: column of the control, needed where there are several.
+        control_scale: factor from the policy's unit and sign to the vehicle's; one,
+            or one for each control.
+        output: column of the control, needed where there are several; of a vehicle
+            with several controls the columns of these.
         name: for messages.
     """
 
@@ -37,13 +46,13 @@ class AbstractBlackBox(AbstractPolicy):
         self,
         name: str,
         preprocess: Preprocess | None = None,
-        control_scale: float = 1.0,
-        output: int | None = None,
+        control_scale: Scale = 1.0,
+        output: Output = None,
     ) -> None:
         self.name = name
         self.preprocess: Preprocess = preprocess or Preprocess()
-        self.control_scale: float = float(control_scale)
-        self.output: int | None = output
+        self.control_scale: Scale = control_scale
+        self.output: Output = output
 
     @abstractmethod
     def answer(self, image: np.ndarray, goals: np.ndarray, step: int) -> np.ndarray:
@@ -75,8 +84,9 @@ class AbstractBlackBox(AbstractPolicy):
             given = np.array(seen.numpy(), order="C")
             answer = self.answer(given, goals, step)
             values = torch.from_numpy(np.array(answer, np.float64))
-            control = steering(values, len(images), self.output, self.name)
-        return to_row(self.control_scale * control, image), (step + 1, past)
+            control = chosen_controls(values, len(images), self.output, self.name)
+        scaled_control = scaled(control, self.control_scale)
+        return to_controls(scaled_control, image), (step + 1, past)
 
     def planes(self, image: Any, memory: Memory) -> np.ndarray:
         """Return the stack of pre-processed frames, whatever their layout."""
@@ -118,8 +128,8 @@ class CallablePolicy(AbstractBlackBox):
         function: Callable[[np.ndarray, np.ndarray, int], Any],
         name: str,
         preprocess: Preprocess | None = None,
-        control_scale: float = 1.0,
-        output: int | None = None,
+        control_scale: Scale = 1.0,
+        output: Output = None,
     ) -> None:
         self.function = function
         AbstractBlackBox.__init__(self, name, preprocess, control_scale, output)

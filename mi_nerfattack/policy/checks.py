@@ -59,37 +59,61 @@ def expand_goals(goal: Any, image: torch.Tensor) -> torch.Tensor:
     return values.expand(len(image))
 
 
-def steering(
-    values: torch.Tensor, count: int, output: int | None, name: str
+#: Column of a control, or columns of several; None where there is one column.
+Output = int | Sequence[int] | None
+#: Factor of a control, or one for each of several.
+Scale = float | Sequence[float]
+
+
+def chosen_controls(
+    values: torch.Tensor, count: int, output: Output, name: str
 ) -> torch.Tensor:
-    """Take the control (n,) out of a network's answer, and refuse NaN.
+    """Take the controls out of a network's answer, and refuse NaN.
 
     Args:
-        values: (n,), (n, 1), or (n, k) where `output` is given; of one image also ()
-            and (k,).
+        values: (n,), (n, 1), or (n, j) where `output` is given; of one image also ()
+            and (j,).
         count: n.
-        output: column of the control.
+        output: column of the control, or k columns of several controls.
         name: of the policy, for messages.
+
+    Returns:
+        (n,), or (n, k) of several columns.
     """
     if count == 1 and values.ndim < 2:  # a network that drops axes of size 1
         values = values.reshape(1, -1)
     shape = tuple(values.shape)
-    if shape != (count,):
+    several = isinstance(output, Sequence)
+    if shape != (count,) or several:
         column = 0 if output is None and shape == (count, 1) else output
-        if len(shape) != 2 or shape[0] != count or column is None or column >= shape[1]:
+        columns = list(column) if isinstance(column, Sequence) else [column]
+        if len(shape) != 2 or shape[0] != count or not _are_within(columns, shape[1]):
             raise InputError(
                 f"{name}: controls {shape} for {count} images; the policy must return "
                 "one number for each image, (n,) or (n, 1), or several, (n, k), and "
-                f"policy.output (is {output}) must tell the column of the control"
+                f"policy.output (is {output}) must tell the column of the control, or "
+                "the columns where the vehicle has several controls"
             )
-        values = values[:, column]
-    bad = (~torch.isfinite(values)).nonzero().flatten().tolist()
+        values = values[:, columns if several else columns[0]]
+    bad = (~torch.isfinite(values)).nonzero().tolist()
     if bad:
+        value = float(values[tuple(bad[0])])
         raise InputError(
-            f"{name}: control {float(values[bad[0]])} for image {bad[0]} of {count}; "
-            "it must be finite: check the weights and policy.preprocess"
+            f"{name}: control {value} for image {bad[0][0]} of {count}; it must be "
+            "finite: check the weights and policy.preprocess"
         )
     return values
+
+
+def scaled(values: torch.Tensor, scale: Scale) -> torch.Tensor:
+    """Multiply controls (n,) or (n, k) by a factor, or by one for each of k."""
+    if isinstance(scale, Sequence):
+        return values * values.new_tensor(scale)
+    return scale * values
+
+
+def _are_within(columns: Sequence[int | None], count: int) -> bool:
+    return len(columns) > 0 and all(c is not None and c < count for c in columns)
 
 
 def misfit(wanted: Sequence[int | None], given: Sequence[int]) -> str:

@@ -9,15 +9,23 @@ from typing import Any
 import numpy as np
 import torch
 
-from mi_nerfattack.backend.torch_arrays import to_row, to_tensor, to_torch
+from mi_nerfattack.backend.torch_arrays import (
+    from_controls,
+    to_controls,
+    to_tensor,
+    to_torch,
+)
 from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.policy.base import AbstractPolicy, Memory
 from mi_nerfattack.policy.checks import (
+    Output,
+    Scale,
     check_hidden,
     check_images,
+    chosen_controls,
     expand_goals,
     misfit,
-    steering,
+    scaled,
     usual_shape,
 )
 from mi_nerfattack.policy.goals import AbstractGoal, declared_goal
@@ -85,7 +93,7 @@ def check_repeatable(
 
     Args:
         module: the module; `PilotNet` is known to be repeatable.
-        evaluate: gives the control (n,).
+        evaluate: gives the control (n,) or (n, k).
         name: for messages.
 
     Raises:
@@ -120,7 +128,7 @@ def check_alone(
     """Refuse a network whose control for one image depends on the rest of the batch.
 
     Args:
-        evaluate: gives the controls (n,) of the first n of two images.
+        evaluate: gives the controls (n,) or (n, k) of the first n of two images.
         name: for messages.
         least: difference that rounding explains.
 
@@ -129,17 +137,18 @@ def check_alone(
     """
     try:
         with torch.no_grad():
-            (alone,), both = evaluate(1).tolist(), evaluate(2).tolist()
+            alone, both = evaluate(1).reshape(1, -1), evaluate(2).reshape(2, -1)
     except InputError:  # it takes batches of another size, and will tell of them
         return
-    scale = max(abs(alone), abs(both[1]), abs(both[1] - both[0]))
-    if abs(both[0] - alone) > MIXED * scale + least:
-        raise InputError(
-            f"{name}: the control for one image is {alone:.6g} alone and "
-            f"{both[0]:.6g} in a batch with another image, so vehicles would influence "
-            "each other; batch statistics do that: export network.eval(), and give "
-            "normalisation layers running statistics"
-        )
+    for one, first, second in torch.cat([alone, both]).T.tolist():
+        scale = max(abs(one), abs(second), abs(second - first))
+        if abs(first - one) > MIXED * scale + least:
+            raise InputError(
+                f"{name}: the control for one image is {one:.6g} alone and {first:.6g} "
+                "in a batch with another image, so vehicles would influence each "
+                "other; batch statistics do that: export network.eval(), and give "
+                "normalisation layers running statistics"
+            )
 
 
 def _tensors(result: Any, name: str) -> tuple[torch.Tensor, ...]:
@@ -168,7 +177,7 @@ class TorchPolicy(AbstractPolicy):
     Args:
         module: takes what `preprocess` and `goal` make of the camera's image, (n, 3,
             height, width), sRGB in [0, 1], unless told otherwise, and gives controls
-            (n,), (n, 1), or (n, k) where `output` tells the column. It is switched to
+            (n,), (n, 1), or (n, j) where `output` tells the column. It is switched to
             evaluation mode, its parameters are frozen, and it is moved to the device
             of the images.
         goal: how the goal is passed; by default ``IntegerGoal(module.goals)`` if the
@@ -176,8 +185,10 @@ class TorchPolicy(AbstractPolicy):
         preprocess: from the camera's image to the network's.
         recurrent: shapes of the hidden states, zero at first, with -1 for the number
             of vehicles: ``[(-1, 64)]``, ``[(1, -1, 32)]``.
-        control_scale: factor from the module's unit and sign to the vehicle's.
-        output: column of the control, needed where there are several.
+        control_scale: factor from the module's unit and sign to the vehicle's; one,
+            or one for each control.
+        output: column of the control, needed where there are several; of a vehicle
+            with k > 1 controls the columns of these, which become (k, n).
         name: for messages; the module's class unless given.
     """
 
@@ -187,8 +198,8 @@ class TorchPolicy(AbstractPolicy):
         goal: AbstractGoal | None = None,
         preprocess: Preprocess | None = None,
         recurrent: Sequence[Sequence[int]] = (),
-        control_scale: float = 1.0,
-        output: int | None = None,
+        control_scale: Scale = 1.0,
+        output: Output = None,
         name: str | None = None,
     ) -> None:
         self.module: torch.nn.Module = module.eval()
@@ -197,8 +208,8 @@ class TorchPolicy(AbstractPolicy):
         self.goal: AbstractGoal = goal or declared_goal(module)
         self.preprocess: Preprocess = preprocess or Preprocess()
         self.recurrent: tuple[tuple[int, ...], ...] = check_hidden(recurrent)
-        self.control_scale: float = float(control_scale)
-        self.output: int | None = output
+        self.control_scale: Scale = control_scale
+        self.output: Output = output
         self.name: str = name or type(module).__name__
         self._checked = False
 
@@ -213,7 +224,7 @@ class TorchPolicy(AbstractPolicy):
         """Evaluate the module and its reverse derivative on first images."""
         memory = self.initial_memory(len(image))
         control, (d_image, *_) = self._pull_back(image, goal, memory, cotangent, ())
-        return to_row(control, image), to_tensor(d_image, image)
+        return to_controls(control, image), to_tensor(d_image, image)
 
     def initial_memory(self, count: int) -> Memory:
         """Return an empty frame stack, where there is one, and zeros."""
@@ -230,7 +241,7 @@ class TorchPolicy(AbstractPolicy):
         self._check(image, goal, memory)
         with torch.no_grad():
             control, after = self._evaluate(to_torch(image), goal, memory)
-        return to_row(control, image), after
+        return to_controls(control, image), after
 
     def planes(self, image: Any, memory: Memory) -> np.ndarray:
         """Return the stack of pre-processed frames, whatever their layout."""
@@ -255,7 +266,7 @@ class TorchPolicy(AbstractPolicy):
         ]
         with torch.enable_grad(), self._plain_layers():
             control, after = self._evaluate(leaves[0], goal, tuple(leaves[1:]))
-        weight = to_torch(cotangent).to(control)
+        weight = from_controls(cotangent).to(control)
         if weight.shape != control.shape:
             raise InputError(
                 f"cotangent: {tuple(weight.shape)} for {tuple(control.shape)} controls"
@@ -301,7 +312,8 @@ class TorchPolicy(AbstractPolicy):
                     several = goals.expand(count)
                     return self._evaluate(pair[:count], several, tuple(hidden))[0]
 
-                check_alone(evaluate, self.name, 1e-6 * abs(self.control_scale))
+                largest = float(np.abs(self.control_scale).max())
+                check_alone(evaluate, self.name, 1e-6 * largest)
             self._checked = True
 
     def _axes(self) -> list[int]:
@@ -324,7 +336,7 @@ class TorchPolicy(AbstractPolicy):
         hidden = memory[1:] if self.preprocess.history else memory
         goals = self.goal.arguments(expand_goals(goal, image), image)
         outputs = call_module(self.module, self.name, network_image, *goals, *hidden)
-        control = steering(outputs[0], len(image), self.output, self.name)
+        control = chosen_controls(outputs[0], len(image), self.output, self.name)
         after = outputs[1:]
         shapes = [tuple(part.shape) for part in after]
         if shapes != [tuple(part.shape) for part in hidden]:
@@ -335,7 +347,7 @@ class TorchPolicy(AbstractPolicy):
                 "(n, k) and tell the column by policy.output"
             )
         stack = (past,) if self.preprocess.history else ()
-        return self.control_scale * control, (*stack, *after)
+        return scaled(control, self.control_scale), (*stack, *after)
 
     def _past(self, like: torch.Tensor, memory: Memory) -> torch.Tensor:
         """Return earlier frames of the stack; none where there is no stack."""

@@ -264,8 +264,7 @@ def simulate(
         step = Step(index, states[-1], seen, memory)
         image = loop.shown(seen, index)
         control, memory = loop.policy.step(image, loop.goal, memory)
-        given, names = control_size(control), loop.dynamics.control_names
-        require_controls(given, names, type(loop.policy).__name__)
+        require_controls(control_size(control), loop.dynamics.control_names)
         controls.append(controls_as(dr.value_t(type(initial)), control))
         older, newer = loop.transition.controls(controls, index, initial)
         states.append(loop.transition.advance(states[-1], older, newer))

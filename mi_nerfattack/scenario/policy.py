@@ -45,6 +45,7 @@ from mi_nerfattack.ranges import Count, Finite, Positive, Whole
 from mi_nerfattack.scenario.named_file import Code, File
 from mi_nerfattack.scenario.section import (
     Kinds,
+    OneOrSeveral,
     Section,
     Trust,
     Unit,
@@ -120,10 +121,9 @@ class PreprocessSection(Section):
 class AbstractPolicySection(Section):
     """What describes every policy."""
 
-    control_scale: NonZero = 1.0  # to rad/s (dubins) or rad, positive to the left
-    #: After `control_scale`; results do not depend on this key.
-    control_unit: Annotated[Unit | None, Field(exclude=True)] = None
-    output: Whole | None = None  # column of the control, where there are several
+    control_scale: OneOrSeveral[NonZero] = 1.0  # to rad/s or rad, positive to the left
+    control_unit: Annotated[Unit | None, Field(exclude=True)] = None  # after scale
+    output: OneOrSeveral[Whole] | None = None  # column or columns of the control
     preprocess: PreprocessSection = PreprocessSection()
     trust_code: Trust = False  # of files that are code: they run with all rights
 

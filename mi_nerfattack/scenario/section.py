@@ -18,6 +18,7 @@ from typing import (
     ClassVar,
     Literal,
     NoReturn,
+    TypeVar,
     get_args,
     get_type_hints,
 )
@@ -26,9 +27,11 @@ import tomlkit
 from pydantic import (
     BaseModel,
     ConfigDict,
+    Discriminator,
     Field,
     GetCoreSchemaHandler,
     GetJsonSchemaHandler,
+    Tag,
     TypeAdapter,
     ValidationError,
     WrapValidator,
@@ -71,6 +74,8 @@ class Section(BaseModel):
     model_config: ClassVar[ConfigDict] = ConfigDict(
         extra="forbid", frozen=True, strict=True
     )
+    #: Keys that do not count at their defaults: digests from before them stay.
+    later: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def defaults(cls) -> dict[str, Any]:
@@ -166,6 +171,16 @@ class Kinds:
         return _reworded(lambda: read(data), reword)
 
 
+_T = TypeVar("_T")
+#: A value, or an array of such.
+OneOrSeveral = Annotated[
+    Annotated[_T, Tag("one")]
+    | Annotated[tuple[_T, ...], Field(min_length=1), Tag("several")],
+    Discriminator(lambda value: "several" if isinstance(value, tuple) else "one"),
+    UNTAGGED,
+]
+
+
 def refuse(key: str, reason: str) -> NoReturn:
     """Raise an error of a key that a check of the whole section found."""
     way = tuple(int(part) if part.isdigit() else part for part in key.split("."))
@@ -249,8 +264,9 @@ def problems(err: ValidationError) -> Iterator[tuple[Location, str]]:
 def _leaves(location: Location, value: Any) -> Iterator[tuple[Location, Any]]:
     inner: list[tuple[str | int, Any]]
     if isinstance(value, Section):
-        keys = type(value).model_fields.items()
+        keys, usual = type(value).model_fields.items(), value.defaults()
         inner = [(k, getattr(value, k)) for k, field in keys if not field.exclude]
+        inner = [(k, v) for k, v in inner if k not in value.later or v != usual[k]]
     elif is_dataclass(value) and hasattr(value, "kind"):
         inner = list(vars(value).items())
     elif isinstance(value, tuple) and value and isinstance(value[0], Section):

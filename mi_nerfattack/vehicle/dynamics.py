@@ -48,6 +48,15 @@ def to_state(states: np.ndarray) -> Any:
     return result
 
 
+def to_control(values: np.ndarray) -> Any:
+    """Upload controls (n, k) of n vehicles, opaque: (n,) if k = 1, otherwise (k, n)."""
+    row = dr.value_t(state_type())
+    rows = [row(column) for column in np.asarray(values, np.float64).T.tolist()]
+    result = rows[0] if len(rows) == 1 else _rows_t(row)(*rows)
+    dr.make_opaque(result)
+    return result
+
+
 def controls_as(row: Any, controls: Any) -> Any:
     """Convert the controls of n vehicles to another precision.
 
@@ -92,19 +101,18 @@ def _rows_t(row: Any) -> Any:
 _ROWS = {dr.VarType.Float32: "ArrayXf", dr.VarType.Float64: "ArrayXf64"}
 
 
-def require_controls(given: int, names: Sequence[str], source: str) -> None:
-    """Raise `InputError` unless somebody gives as many controls as a vehicle takes.
+def require_controls(given: int, names: Sequence[str]) -> None:
+    """Raise `InputError` unless a policy gives as many controls as its vehicle takes.
 
     Args:
-        given: number of controls.
+        given: number of controls of an image.
         names: of the controls that the vehicle takes.
-        source: who gives them, for the message.
     """
     if given != len(names):
         raise InputError(
-            f"{source} gives {given}, the vehicle takes {len(names)}: "
-            f"{', '.join(names)}; let it return so many, in this order, or take "
-            "another vehicle"
+            f"controls: the policy gives {given}, the vehicle takes {len(names)}: "
+            f"{', '.join(names)}; let the policy return so many, in this order, or "
+            "take another vehicle"
         )
 
 

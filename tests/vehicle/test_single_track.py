@@ -214,7 +214,7 @@ test_refused = refusals(
     (lambda: KinematicSingleTrack(max_brake=-1.0), "max_brake"),
     (lambda: DynamicSingleTrack(mass=0.0), "mass"),
     (
-        lambda: require_controls(1, ROLLING.control_names, "the policy"),
+        lambda: require_controls(1, ROLLING.control_names),
         "gives 1, the vehicle takes 2: steering, acceleration",
     ),
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mi_nerfattack.policy.black_box import AbstractBlackBox
+from mi_nerfattack.policy.checks import Output, Scale
 from mi_nerfattack.policy.http.client import PolicyClient
 from mi_nerfattack.policy.preprocess import Preprocess
 
@@ -26,8 +27,8 @@ class HttpPolicy(AbstractBlackBox):
         timeout_s: float = 10.0,
         retries: int = 2,
         preprocess: Preprocess | None = None,
-        control_scale: float = 1.0,
-        output: int | None = None,
+        control_scale: Scale = 1.0,
+        output: Output = None,
         token: str = "",
     ) -> None:
         self.client: PolicyClient = PolicyClient(url, token, timeout_s, retries)

@@ -64,7 +64,7 @@ class _Drive:
     step: int
     request: bytes
     count: int
-    controls: list[float]
+    controls: list[Any]
     after: Memory
 
 
@@ -111,8 +111,8 @@ class PolicyServer(HttpServer):
         images: np.ndarray,
         goals: list[int],
         step: int,
-    ) -> list[float]:
-        """Return the control of each image.
+    ) -> list[Any]:
+        """Return the control of each image: a number, or a list of several.
 
         Args:
             client: whose drive it is.
@@ -129,7 +129,7 @@ class PolicyServer(HttpServer):
             before = self._memory(client, len(images), step)
             try:
                 row, after = self._policy.step(mi.TensorXf(images), goals, before)
-                controls = np.array(row, np.float64)
+                controls = np.array(row, np.float64).T
             except InputError as err:
                 raise RefusedError(422, str(err)) from err
             except Exception as err:  # a user's policy raises whatever it likes
