@@ -175,8 +175,7 @@ def speed_findings(world: World) -> Iterator[str]:
     scene, drive, period = scenario.scene, scenario.drive, scenario.vehicle.dt_s
     route = Route.from_file(scene.routes.file, scene.route)
     state = to_state(dynamics.extend(world.initial[:1]))
-    velocity = dynamics.derivative(state, type(state[0])(0)).numpy()[:2]
-    speed = float(np.linalg.norm(velocity))
+    speed = float(dynamics.speed(state).numpy()[0])
     if np.isclose(speed, route.speed_ms, rtol=_SPEEDS):
         return
     horizon, expected = world.horizon, drive.steps(route, period)
