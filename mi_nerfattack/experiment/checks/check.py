@@ -43,6 +43,7 @@ from mi_nerfattack.report.plots.place import Look, Overlay, place_picture
 from mi_nerfattack.rollout.drive import OWN, Drive, departure_limit
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import World
+from mi_nerfattack.vehicle.dynamics import controls_as, to_control
 
 _LONGEST_PX = 560  # of the pictures from above
 _CHASE = 400, 200, 75.0  # pixels and field of view
@@ -106,7 +107,9 @@ class Check:
     def _slope(self, frame: CameraFrame) -> None:
         """Look whether the control has a derivative by the first image."""
         image, goal = policy_image(frame.image), self.world.route.goal
-        _, d_image = self.world.policy.vjp(image, goal, mi.Float(1))
+        ones = np.ones((1, self.world.motion.dynamics.control_size))
+        cotangent = controls_as(mi.Float, to_control(ones))
+        _, d_image = self.world.policy.vjp(image, goal, cotangent)
         if not d_image.numpy().any():
             self.doubts.append(
                 "the derivative of the policy's control by the first image is exactly "
