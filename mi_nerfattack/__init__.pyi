@@ -53,10 +53,12 @@ from .training import frames as frames
 from .vehicle import RK4 as RK4
 from .vehicle import Ackermann as Ackermann
 from .vehicle import Dubins as Dubins
+from .vehicle import DynamicSingleTrack as DynamicSingleTrack
 from .vehicle import ExplicitEuler as ExplicitEuler
 from .vehicle import FunctionDynamics as FunctionDynamics
 from .vehicle import ImplicitMidpoint as ImplicitMidpoint
 from .vehicle import KinematicBicycle as KinematicBicycle
+from .vehicle import KinematicSingleTrack as KinematicSingleTrack
 from .vehicle import RateLimitedAckermann as RateLimitedAckermann
 from .vehicle import Route as Route
 from .vehicle import TorchDynamics as TorchDynamics

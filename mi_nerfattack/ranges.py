@@ -21,6 +21,7 @@ from mi_nerfattack.errors import InputError
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Negative = Annotated[float, Field(lt=0, allow_inf_nan=False)]
 Seconds = Annotated[float, Field(gt=0, allow_inf_nan=False, description=", seconds")]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -118,7 +119,7 @@ def _allowed(hint: Any) -> str:
         (low, least), (high, most) = limits.items()
         interval = f"{_SIGNS[low]}{least:.10g}, {most:.10g}{_SIGNS[high]}"
         return f"{noun} in {interval}{unit}"
-    words = {"gt": " above ", "ge": " of at least "}
+    words = {"gt": " above ", "ge": " of at least ", "lt": " below "}
     return noun + "".join(f"{words[n]}{limit}" for n, limit in limits.items()) + unit
 
 

@@ -2,11 +2,50 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.ranges import Acute, CarUnit, Positive, checked
+from mi_nerfattack.ranges import Acute, CarUnit, Name, Negative, Positive, checked
 from mi_nerfattack.render.camera.intrinsics import CameraMount
+
+
+@dataclass(frozen=True)
+@checked("control")
+class Control:
+    """A control of a vehicle besides its first one, which steers.
+
+    Args:
+        name: "acceleration", or a name of your own.
+        unit: such as "m/s^2".
+        lowest: smallest value that has an effect, negative.
+        highest: largest value that has an effect.
+    """
+
+    name: Name
+    unit: str
+    lowest: Negative
+    highest: Positive
+
+
+#: Names of the first control by its unit.
+_STEERING = {"rad/s": "heading_rate", "rad": "steering"}
+
+
+def control_names(unit: str, more: Sequence[Control]) -> tuple[str, ...]:
+    """Return the names of a vehicle's controls.
+
+    Args:
+        unit: of the first one.
+        more: the others.
+    """
+    return _STEERING.get(unit, "control"), *(control.name for control in more)
+
+
+def acceleration_of(more: Sequence[Control]) -> tuple[float, float] | None:
+    """Return the lowest and the highest acceleration, m/s^2, where it is a control."""
+    found = [item for item in more if item.name == "acceleration"]
+    return (found[0].lowest, found[0].highest) if found else None
 
 
 @dataclass(frozen=True)
@@ -26,6 +65,7 @@ class Car:
             "rad" of a steering angle, "other" of what drives no car with wheels.
         max_control: largest control that has an effect, in that unit; of a steering
             angle at most `max_steer`.
+        more_controls: those that it takes after this one.
     """
 
     wheelbase: Positive = 2.7
@@ -37,6 +77,7 @@ class Car:
     max_steer: Acute = 0.75
     control_unit: CarUnit = "rad/s"
     max_control: Positive = 1.5
+    more_controls: tuple[Control, ...] = ()
 
     def __post_init__(self) -> None:
         if self.control_unit == "rad" and self.max_control > self.max_steer:

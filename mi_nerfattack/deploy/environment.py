@@ -13,13 +13,15 @@ import numpy as np
 
 from mi_nerfattack.backend.arrays import aligned
 from mi_nerfattack.backend.colour import srgb_to_linear_numpy
+from mi_nerfattack.deploy.car import Control, control_names
+from mi_nerfattack.deploy.vehicle import Controls
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.render.camera.rig import Layout, Rig
 from mi_nerfattack.rollout.drive import Drive
 from mi_nerfattack.rollout.loop import numbers_of, stacked
-from mi_nerfattack.vehicle.dynamics import to_state
+from mi_nerfattack.vehicle.dynamics import require_controls, to_state
 from mi_nerfattack.vehicle.route.route import Route
 
 
@@ -143,8 +145,10 @@ class AbstractEnvironment(ABC):
         rig: the cameras whose images are observed, side by side.
         camera: intrinsics of the first of them.
         period: seconds between two images.
-        max_control: largest control that has an effect, in the unit that `step` takes.
+        max_control: largest control that has an effect, in the unit that `step` takes;
+            of several controls, the first one's.
         control_unit: "rad/s" of a heading rate, or "rad" of a steering angle.
+        more_controls: those that `step` takes after the first one.
     """
 
     name: str
@@ -153,6 +157,12 @@ class AbstractEnvironment(ABC):
     period: float
     max_control: float
     control_unit: str
+    more_controls: tuple[Control, ...] = ()
+
+    @property
+    def control_names(self) -> tuple[str, ...]:
+        """Names of the controls, in their order."""
+        return control_names(self.control_unit, self.more_controls)
 
     @abstractmethod
     def reset(
@@ -171,21 +181,23 @@ class AbstractEnvironment(ABC):
         """
 
     @abstractmethod
-    def step(self, control: float) -> CameraFrame:
+    def step(self, control: Controls) -> CameraFrame:
         """Hold a control for one period.
 
         Args:
             control: heading rate (rad/s) or steering angle (rad), as the environment
-                was made; positive to the left. Beyond `max_control` it saturates.
+                was made; positive to the left. Beyond `max_control` it saturates. Of
+                several controls one number each, in the order of `control_names`.
 
         Returns:
             The frame at the end of the period.
 
         Raises:
-            InputError: the control is not finite, or nothing was reset before.
+            InputError: the control is not finite, there are more or fewer than the
+                vehicle takes, or nothing was reset before.
         """
 
-    def advance(self, control: float) -> None:
+    def advance(self, control: Controls) -> None:
         """Hold a control for one period as `step` does, but look at nothing."""
         self.step(control)
 
@@ -286,8 +298,8 @@ def drive(
         label: what the result calls the environment; its name by default.
 
     Raises:
-        InputError: the policy does not take the camera's images, or its control is
-            not finite.
+        InputError: the policy does not take the camera's images, its control is not
+            finite, or it gives more or fewer than the vehicle takes.
     """
     frame = environment.reset(route, np.asarray(pose, np.float64), seed)
     memory = policy.initial_memory(1)
@@ -296,7 +308,7 @@ def drive(
         image = policy_image(frame.image)
         numbers = told(policy, environment, route, index)
         row, memory = policy.step(image, route.goal, memory, numbers)
-        controls.append(float(np.array(row)[0]))
+        controls.append(single_control(row, environment.control_names))
         frame = environment.step(controls[-1])
         states.append(environment.state)
         if on_step is not None:
@@ -337,6 +349,21 @@ def told(
         row = to_state(np.full((1, 3), environment.speed))[0]  # opaque
     time = step * environment.period
     return stacked(numbers_of(policy.numbers, state, row, time, route))
+
+
+def single_control(row: Any, names: Sequence[str]) -> float | np.ndarray:
+    """Return what a policy gave for one image: a number, or (k,) of k > 1 controls.
+
+    Args:
+        row: (1,) or (k, 1), of Dr.Jit.
+        names: of the controls that the vehicle takes.
+
+    Raises:
+        InputError: there are not as many.
+    """
+    values = np.array(row, np.float64).reshape(-1)
+    require_controls(len(values), names)
+    return float(values[0]) if len(values) == 1 else values
 
 
 def policy_image(image: np.ndarray) -> mi.TensorXf:

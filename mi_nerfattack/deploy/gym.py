@@ -32,8 +32,10 @@ class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
     nothing; `camera_to_world` (4, 4) float64, OpenCV axes, metres; `goal` (), the
     route's goal.
 
-    Action: `Box` (1,) float32 from -1 to 1, the share of `environment.max_control`, in
-    `environment.control_unit`; positive steers to the left.
+    Action: `Box` (k,) float32 from -1 to 1, one number for each of the k controls of
+    `environment.control_names`. The first is the share of `environment.max_control`, in
+    `environment.control_unit`; positive steers to the left. The others are shares of
+    the highest value of the control, or where they are negative of the lowest.
 
     Reward: 1 in the lane's centre after the step, falling evenly to 0 where the
     vehicle's side passes the lane's border, so that a step in the lane is always worth
@@ -88,7 +90,8 @@ class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
             "render_fps": max(1, round(1 / environment.period)),
         }
         self.observation_space = _observations(environment, routes)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        size = len(environment.control_names)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (size,), np.float32)
         self._route = routes[0]
         self._frame: CameraFrame | None = None
         self._steps, self._closed = 0, False
@@ -119,20 +122,11 @@ class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         """Hold a control for one period.
 
         Raises:
-            InputError: the action is not one finite number, or the environment is
-                closed.
+            InputError: the action is not one finite number for each control, or the
+                environment is closed.
         """
         self._require_open()
-        try:
-            given = np.asarray(action)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"action: {action!r}; one control, shape (1,)") from error
-        if given.size != 1:
-            raise InputError(f"action: shape {given.shape}; one control, shape (1,)")
-        if given.dtype.kind not in "iuf":
-            raise InputError(f"action: {action!r}; a number from -1 to 1")
-        control = float(given.item()) * self.environment.max_control
-        frame = self.environment.step(control)
+        frame = self.environment.step(self._controls(action))
         self._frame, self._steps = frame, self._steps + 1
         info = self._info()
         share = abs(info["cross_track_m"]) / self._limits[self._route.name]
@@ -152,6 +146,31 @@ class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         """Close the environment."""
         self._closed = True
         self.environment.close()
+
+    def _controls(self, action: np.ndarray) -> float | np.ndarray:
+        """Return the controls that an action stands for."""
+        names, more = self.environment.control_names, self.environment.more_controls
+        size = len(names)
+        wanted = (
+            "one control, shape (1,)"
+            if size == 1
+            else f"{size} controls ({', '.join(names)}), shape ({size},)"
+        )
+        try:
+            given = np.asarray(action)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"action: {action!r}; {wanted}") from error
+        if given.size != size:
+            raise InputError(f"action: shape {given.shape}; {wanted}")
+        if given.dtype.kind not in "iuf":
+            raise InputError(f"action: {action!r}; a number from -1 to 1")
+        if size == 1:
+            return float(given.item()) * self.environment.max_control
+        shares = given.reshape(-1).astype(np.float64)
+        largest = self.environment.max_control
+        high = np.array([largest, *(control.highest for control in more)])
+        low = np.array([largest, *(-control.lowest for control in more)])
+        return shares * np.where(shares < 0, low, high)
 
     def _require_open(self) -> None:
         if self._closed:

@@ -28,7 +28,9 @@ def kinematic_vehicle(place: Place) -> KinematicVehicle:
         steered = Ackermann(wheelbase=car.wheelbase, max_steer=car.max_control)
         turned = Dubins(max_heading_rate=car.max_control)
         motion = Motion(steered if car.control_unit == "rad" else turned)
-    return KinematicVehicle(motion, place.period, car.max_control, car.control_unit)
+    return KinematicVehicle(
+        motion, place.period, car.max_control, car.control_unit, car.more_controls
+    )
 
 
 def mitsuba_views(place: Place, conditions: Conditions) -> list[MitsubaView]:
@@ -124,7 +126,12 @@ def _replay(place: Place, conditions: Conditions) -> AbstractEnvironment:
     )
     car = place.car
     return ReplayEnvironment(
-        recording, place.mount, place.period, car.max_control, car.control_unit
+        recording,
+        place.mount,
+        place.period,
+        car.max_control,
+        car.control_unit,
+        car.more_controls,
     )
 
 

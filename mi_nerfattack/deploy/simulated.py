@@ -15,7 +15,7 @@ from mi_nerfattack.deploy.environment import (
     join_frames,
     policy_image,
 )
-from mi_nerfattack.deploy.vehicle import AbstractVehicle, checked_pose
+from mi_nerfattack.deploy.vehicle import AbstractVehicle, Controls, checked_pose
 from mi_nerfattack.deploy.views.paste import AbstractView
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.disturbance import disturbed
@@ -44,6 +44,7 @@ class AbstractSimulation(AbstractEnvironment):
         self.period: float = period
         self.max_control: float = vehicle.max_control
         self.control_unit: str = vehicle.control_unit
+        self.more_controls = vehicle.more_controls
         self._seed, self._steps = 0, -1
         self.blur_px, self.noise_sd = 0.0, 0.0  # of the camera
 
@@ -58,16 +59,16 @@ class AbstractSimulation(AbstractEnvironment):
         self._seed, self._steps = seed, 0
         return self._disturbed(self._observe())
 
-    def step(self, control: float) -> CameraFrame:
+    def step(self, control: Controls) -> CameraFrame:
         """Drive one period and render."""
         self.advance(control)
         return self._disturbed(self._observe())
 
-    def advance(self, control: float) -> None:
+    def advance(self, control: Controls) -> None:
         """Drive one period and render nothing; what changes the motion belongs here."""
         if self._steps < 0:
             raise InputError(f"environment {self.name!r}: step comes after reset")
-        self.vehicle.advance(float(control))
+        self.vehicle.advance(control)
         self._steps += 1
 
     @property

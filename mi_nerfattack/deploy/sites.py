@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mi_nerfattack.deploy.car import Car, acceleration_of
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.place import Conditions, Place
 from mi_nerfattack.deploy.registry import (
@@ -213,7 +214,7 @@ class PlaceSite(AbstractSite):
             "files": _checksums(paths),
             "camera": to_colmap(place.camera)[1],
             "mount": place.mount.described(),
-            "car": asdict(place.car),
+            "car": _car(place.car),
             "period": place.period,
             "weather": asdict(self.weather),
             **({} if self.vehicle is None else {"vehicle": dict(self.vehicle)}),
@@ -223,20 +224,32 @@ class PlaceSite(AbstractSite):
         }
 
 
+def _car(car: Car) -> dict[str, Any]:
+    """Return a car's numbers; of a car with one control nothing about others."""
+    more = ("more_controls",) if car.more_controls else ()
+    kept = [f.name for f in fields(car) if f.name != "more_controls"]
+    return {name: asdict(car)[name] for name in (*kept, *more)}
+
+
 def expert_of(site: AbstractSite, route: Route) -> AbstractExpert:
     """Make the expert that labels a site's frames on a route."""
     car = site.car
     return expert_for(
-        car.control_unit, route, site.period, car.max_control, car.wheelbase
+        car.control_unit,
+        route,
+        site.period,
+        car.max_control,
+        car.wheelbase,
+        acceleration=acceleration_of(car.more_controls),
     )
 
 
 def probe_expert(site: AbstractSite, route: Route) -> list[float]:
-    """Return an expert's controls beside a route's middle, which tell experts apart."""
+    """Return an expert's steering beside a route's middle: it tells experts apart."""
     expert, controls = expert_of(site, route), []
     for lateral, heading in ((0.1, 0.0), (-0.2, 0.05), (0.0, -0.1)):
         state = route.pose_at(route.length / 2, lateral, heading)
-        controls.append(round(float(expert.control(state)[0]), 4))
+        controls.append(round(float(np.ravel(expert.control(state))[0]), 4))
     return controls
 
 

@@ -2,30 +2,46 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from mi_nerfattack.deploy.car import Control, control_names
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import planar_body
-from mi_nerfattack.vehicle.dynamics import AbstractDynamics, to_state
+from mi_nerfattack.vehicle.dynamics import (
+    AbstractDynamics,
+    require_controls,
+    to_control,
+    to_state,
+)
 from mi_nerfattack.vehicle.integrators import RK4, AbstractIntegrator, Transition
 from mi_nerfattack.vehicle.route.polyline import LARGEST_M
+
+#: One control, or one number for each of several.
+Controls = float | Sequence[float] | np.ndarray
 
 
 class AbstractVehicle(ABC):
     """Vehicle that holds a control for a while.
 
     Attributes:
-        max_control: largest control that has an effect.
+        max_control: largest control that has an effect; of several, the first one's.
         control_unit: "rad/s" of a heading rate, or "rad" of a steering angle.
+        more_controls: those after the first one.
     """
 
     max_control: float
     control_unit: str
+    more_controls: tuple[Control, ...] = ()
+
+    @property
+    def control_names(self) -> tuple[str, ...]:
+        """Names of the controls, in their order."""
+        return control_names(self.control_unit, self.more_controls)
 
     @abstractmethod
     def reset(self, pose: np.ndarray, speed: float, seed: int = 0) -> None:
@@ -38,11 +54,12 @@ class AbstractVehicle(ABC):
         """
 
     @abstractmethod
-    def advance(self, control: float) -> None:
-        """Hold a control for one period.
+    def advance(self, control: Controls) -> None:
+        """Hold a control, or one number for each of several, for one period.
 
         Raises:
-            InputError: the control is not finite, or the vehicle was not reset.
+            InputError: the control is not finite, there are more or fewer than the
+                vehicle takes, or it was not reset.
         """
 
     @property
@@ -77,10 +94,21 @@ def checked_pose(pose: Any) -> np.ndarray:
     return array
 
 
-def require_control(control: float) -> None:
-    """Raise `InputError` unless a control is finite."""
-    if not math.isfinite(control):
+def checked_control(control: Controls, names: Sequence[str]) -> np.ndarray:
+    """Copy controls to (k,) float64.
+
+    Args:
+        control: one number, or k.
+        names: of the k controls that are taken.
+
+    Raises:
+        InputError: a number is not finite, or there are not k.
+    """
+    values = np.array(control, np.float64).reshape(-1)
+    require_controls(len(values), names)
+    if not np.isfinite(values).all():
         raise InputError(f"control: {control}; a policy must return finite numbers")
+    return values
 
 
 @dataclass(frozen=True)
@@ -108,6 +136,10 @@ class KinematicVehicle(AbstractVehicle):
         period: seconds that a control is held.
         max_control: where the model saturates the control.
         control_unit: "rad/s" (Dubins) or "rad" (models with a steering angle).
+        more_controls: of the model, after the first one.
+
+    Raises:
+        InputError: the model takes another number of controls.
     """
 
     def __init__(
@@ -116,8 +148,15 @@ class KinematicVehicle(AbstractVehicle):
         period: float,
         max_control: float,
         control_unit: str = "rad/s",
+        more_controls: tuple[Control, ...] = (),
     ) -> None:
-        self.motion = motion
+        if motion.dynamics.control_size != 1 + len(more_controls):
+            names = ", ".join(motion.dynamics.control_names)
+            raise InputError(
+                f"more_controls: {len(more_controls)}; the model takes {names}: give "
+                "one Control for each name after the first"
+            )
+        self.motion, self.more_controls = motion, more_controls
         self.period, self.max_control = period, max_control
         self.control_unit = control_unit
         self._transitions: dict[float | None, Transition] = {}
@@ -129,9 +168,9 @@ class KinematicVehicle(AbstractVehicle):
         """Put the vehicle somewhere; `seed` has no effect on it."""
         del seed
         motion = self.motion
-        key = speed if "speed" in motion.dynamics.__dataclass_fields__ else None
+        key = speed if "speed_ms" in motion.dynamics.__dataclass_fields__ else None
         if key not in self._transitions:
-            changed = {} if key is None else {"speed": key}
+            changed = {} if key is None else {"speed_ms": key}
             self._transitions[key] = Transition(
                 replace(motion.dynamics, **changed),
                 motion.integrator,
@@ -144,12 +183,12 @@ class KinematicVehicle(AbstractVehicle):
         self._state = to_state(extended)
         self._controls = []
 
-    def advance(self, control: float) -> None:
+    def advance(self, control: Controls) -> None:
         """Drive one period."""
         if self._transition is None:
             raise InputError("vehicle: advance comes after reset")
-        require_control(control)
-        self._controls.append(to_state(np.full((1, 3), control))[0])
+        values = checked_control(control, self.control_names)
+        self._controls.append(to_control(values[None]))
         index = len(self._controls) - 1
         older, newer = self._transition.controls(self._controls, index, self._state)
         self._state = self._transition.advance(self._state, older, newer)

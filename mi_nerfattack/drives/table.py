@@ -28,8 +28,9 @@ STEPS = {
     "cross_track_m": NUMBER,
     "departed": WHOLE,
 }
-#: Columns after them, a number each: ``state_3`` is row 3, from 0, of the state.
-STATE_ROWS = re.compile(r"state_[0-9]+")
+#: Columns after them, a number each: ``state_3`` is row 3, from 0, of the state, and
+#: ``control_1`` the second of several controls, the first of which is ``control``.
+FURTHER = re.compile(r"(state|control)_[0-9]+")
 _REMEDY = "give the command that wrote the table again"
 
 
@@ -87,18 +88,21 @@ def write_steps(
     Row `step` t = 1..T holds the state reached at `time_s`, the control that led to
     the state, and its signed cross-track error; `departed` is 1 beyond the limit. The
     rows of the state after the heading follow as `state_3`, `state_4`, ...; they are
-    empty where an environment has none.
+    empty where an environment has none. Of several controls `control` is the first, and
+    the others follow as `control_1`, ...
     """
     parts = []
     for drive in drives:
         out = drive.departed(lane_of(drive.route, lanes).wheel_m).astype(int)
         labels = (drive.environment, drive.route, drive.case, drive.run, drive.seed)
-        figures = (drive.controls, drive.cross_track_m, out)
+        figures = (drive.first_controls, drive.cross_track_m, out)
         steps = range(1, len(out) + 1)
         columns = (*labels, steps, drive.time_s, *drive.poses[1:].T, *figures)
         named = dict(zip(STEPS, columns, strict=True))
         more = enumerate(drive.states[1:, 3:].T, start=3)
         named |= {f"state_{row}": values for row, values in more}
+        others = drive.controls.reshape(len(out), -1).T[1:]
+        named |= {f"control_{k}": values for k, values in enumerate(others, start=1)}
         parts.append(pd.DataFrame(named))
     write_csv(path, pd.concat(parts))
 

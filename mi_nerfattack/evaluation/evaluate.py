@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -33,6 +32,7 @@ from mi_nerfattack.rollout.drive import (
     random_case,
 )
 from mi_nerfattack.system.workers import tally
+from mi_nerfattack.vehicle.dynamics import controls_as, to_control
 from mi_nerfattack.vehicle.expert import AbstractExpert
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -112,7 +112,7 @@ class ExpertPolicy(AbstractPolicy):
         """Ask the expert."""
         del image, goal
         control = self.expert.control(self.environment.state)
-        return dr.opaque(mi.Float, float(control[0]), 1)
+        return controls_as(mi.Float, to_control(control.reshape(1, -1)))
 
     def vjp(self, image: Any, goal: Any, cotangent: Any) -> tuple[Any, Any]:
         """Refuse: what it sees is no image."""

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.backend.versions import versions
+from mi_nerfattack.deploy.car import acceleration_of
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.place import Place
 from mi_nerfattack.deploy.registry import environment_versions, make_environment
@@ -224,6 +225,7 @@ class EvaluateDriver(AbstractDriver):
             environment.period,
             environment.max_control,
             self._work.place.car.wheelbase,
+            acceleration=acceleration_of(environment.more_controls),
         )
         return ExpertPolicy(environment, expert)
 

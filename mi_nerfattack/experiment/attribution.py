@@ -28,7 +28,8 @@ def control_changes(drives: Sequence[Drive], unit: str, seed: int) -> dict[str, 
 
     ``control_change_mean`` and ``control_change_max`` are of the distance from the
     control with own textures in the same frame, over all frames and runs; the interval
-    of the mean is over runs, null of few; see `summary.interval`.
+    of the mean is over runs, null of few; see `summary.interval`. Of several controls
+    they are of the first one, which steers.
 
     Args:
         drives: of recorded drives; of each environment one past own textures.
@@ -40,7 +41,8 @@ def control_changes(drives: Sequence[Drive], unit: str, seed: int) -> dict[str, 
         base = _own(group)
         cases: dict[str, Any] = {}
         for case in CASES:
-            changes = [abs(d.controls - base.controls) for d in group if d.case == case]
+            own, mine = base.first_controls, [d for d in group if d.case == case]
+            changes = [abs(drive.first_controls - own) for drive in mine]
             if not changes or case == OWN:
                 continue
             means = np.array([change.mean() for change in changes])
@@ -55,14 +57,14 @@ def control_changes(drives: Sequence[Drive], unit: str, seed: int) -> dict[str, 
         found[environment] = {
             "frames": len(base.controls),
             "control_unit": unit,
-            "control_abs_mean": float(abs(base.controls).mean()),
+            "control_abs_mean": float(abs(base.first_controls).mean()),
             "cases": cases,
         }
     return found
 
 
 def write_control_changes(output: Path, drives: Sequence[Drive]) -> None:
-    """Write ``controls.csv``, if there are any.
+    """Write ``controls.csv``, if there are any: of several controls the first one.
 
     Args:
         output: the run folder.
@@ -76,8 +78,8 @@ def write_control_changes(output: Path, drives: Sequence[Drive]) -> None:
         for drive in group:
             about = {"environment": environment, "case": drive.case, "run": drive.run}
             about |= {"step": range(1, len(drive.time_s) + 1), "time_s": drive.time_s}
-            about["control"] = drive.controls
-            about["change"] = drive.controls - base.controls
+            about["control"] = drive.first_controls
+            about["change"] = drive.first_controls - base.first_controls
             parts.append(pd.DataFrame(about))
     write_csv(output / "controls.csv", pd.concat(parts))
 

@@ -9,7 +9,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from mi_nerfattack.backend.torch_arrays import to_controls, to_tensor, to_torch
+from mi_nerfattack.backend.torch_arrays import (
+    from_controls,
+    to_controls,
+    to_tensor,
+    to_torch,
+)
 from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.policy.action import Action
 from mi_nerfattack.policy.base import AbstractPolicy, Memory, Numbers
@@ -217,8 +222,7 @@ class TorchPolicy(AbstractPolicy):
             control, after = self._evaluate(
                 leaves[0], goal, tuple(leaves[1:end]), *leaves[end:]
             )
-        weight = to_torch(cotangent).to(control)
-        weight = weight if weight.ndim == 1 else weight.T
+        weight = from_controls(cotangent).to(control)
         if weight.shape != control.shape:
             raise InputError(
                 f"cotangent: {tuple(weight.shape)} for {tuple(control.shape)} controls"
@@ -267,10 +271,8 @@ class TorchPolicy(AbstractPolicy):
                 def evaluate(count: int) -> torch.Tensor:
                     hidden = (torch.cat([part] * count, axis) for part, axis in parts)
                     told = None if one is None else one.expand(count, -1)
-                    found, _ = self._evaluate(
-                        pair[:count], goals.expand(count), tuple(hidden), told
-                    )
-                    return found if found.ndim == 1 else found[:, 0]
+                    several = goals.expand(count)
+                    return self._evaluate(pair[:count], several, tuple(hidden), told)[0]
 
                 scale = self.action.scale
                 largest = max(map(abs, scale if isinstance(scale, tuple) else (scale,)))

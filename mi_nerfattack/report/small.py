@@ -64,14 +64,16 @@ def _drive(drive: Drive) -> bytes:
 
 @draw.register
 def _trajectory(trajectory: Trajectory) -> bytes:
-    """Draw the paths from above, and the controls over time."""
+    """Draw the paths from above, and over time the controls; of several the first."""
     with blank(_SIZE_IN, _DPI) as figure:
         above, controls = figure.subplots(1, 2)
         vehicles = "vehicle" if trajectory.count == 1 else "vehicles"
         paths = trajectory.states_numpy()[:, :, :2]
         _draw_paths(above, paths, f"{trajectory.count} {vehicles}")
         time_s = trajectory.dt * np.arange(trajectory.horizon)
-        controls.plot(time_s, trajectory.controls_numpy().T, linewidth=1)
+        given = trajectory.controls_numpy()
+        steering = given if given.ndim == 2 else given[..., 0]
+        controls.plot(time_s, steering.T, linewidth=1)
         controls.set_xlabel("time (s)")
         controls.set_title("the policy's control")
         return png(figure)

@@ -56,7 +56,8 @@ class Drive:
             x and y in metres, heading in radians, then what the vehicle adds, see
             `AbstractEnvironment.state`. Controls that a delay holds back are no rows:
             they are among `controls`.
-        controls: (T,), the policy's control of each period, as it came to state t+1.
+        controls: (T,), the policy's control of each period, as it came to state t+1;
+            (T, k) of a vehicle with k > 1 controls.
         cross_track_m: (T,), signed cross-track error of `states[1:]`, metres.
         time_s: (T,), time of `states[1:]`, seconds, increasing.
 
@@ -85,7 +86,8 @@ class Drive:
             raise InputError("Drive.controls: no step; a drive has at least one")
         rows = max(3, np.shape(self.states)[-1] if np.ndim(self.states) else 0)
         self._freeze("states", (steps + 1, rows))
-        for name in ("controls", "cross_track_m", "time_s"):
+        self._freeze("controls", (steps, *np.shape(self.controls)[1:2]))
+        for name in ("cross_track_m", "time_s"):
             self._freeze(name, (steps,))
         if np.any(np.diff(self.time_s) <= 0):
             raise InputError("Drive.time_s: not increasing; give seconds step by step")
@@ -122,6 +124,11 @@ class Drive:
     def poses(self) -> np.ndarray:
         """Return x and y in metres and heading in radians, (T+1, 3)."""
         return self.states[:, :3]
+
+    @property
+    def first_controls(self) -> np.ndarray:
+        """Return the first control of each period, (T,), which steers."""
+        return self.controls if self.controls.ndim == 1 else self.controls[:, 0]
 
     @property
     def distance_m(self) -> np.ndarray:

@@ -27,7 +27,13 @@ from mi_nerfattack.rollout.sensor import (
     AbstractSensor,
     Observation,
 )
-from mi_nerfattack.vehicle.dynamics import AbstractDynamics, to_state
+from mi_nerfattack.vehicle.dynamics import (
+    AbstractDynamics,
+    control_size,
+    controls_as,
+    require_controls,
+    to_state,
+)
 from mi_nerfattack.vehicle.integrators import AbstractIntegrator, Transition
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -227,7 +233,8 @@ class Trajectory:
 
     Attributes:
         states: horizon + 1 arrays (m, n), metres and radians, evaluated.
-        controls: horizon rows (n,), the policy's raw outputs, evaluated.
+        controls: of each period (n,), or (k, n) of k > 1: the policy's raw outputs,
+            evaluated.
         dt: control period, seconds.
         kept: what `keep` returned for each control period.
         camera_path: None where the camera was on the vehicle.
@@ -285,8 +292,8 @@ class Trajectory:
         return np.stack([np.array(s) for s in self.states], axis=-1).transpose(1, 2, 0)
 
     def controls_numpy(self) -> np.ndarray:
-        """Controls as (n, horizon) float64."""
-        return np.stack([np.array(c) for c in self.controls], axis=-1)
+        """Controls as (n, horizon) float64; of k > 1 as (n, horizon, k)."""
+        return np.stack([np.array(c).T for c in self.controls], axis=1)
 
     def history(self) -> StateHistory:
         """Lay all states but the first side by side, detached."""
@@ -314,7 +321,8 @@ def simulate(
 
     Raises:
         ValueError: horizon below 1, or a state of the wrong size.
-        InputError: the policy fails, or an implicit step does not converge.
+        InputError: the policy fails or gives another number of controls than the
+            vehicle takes, or an implicit step does not converge.
     """
     if horizon < 1:
         raise ValueError(f"horizon: {horizon}; at least 1")
@@ -334,7 +342,8 @@ def simulate(
         step = Step(index, states[-1], seen, memory)
         image, numbers = loop.shown(seen, index), loop.numbers(states[-1], index)
         control, memory = loop.policy.step(image, loop.goal, memory, numbers)
-        controls.append(dr.value_t(type(initial))(control))
+        require_controls(control_size(control), loop.dynamics.control_names)
+        controls.append(controls_as(dr.value_t(type(initial)), control))
         older, newer = loop.transition.controls(controls, index, initial)
         states.append(loop.transition.advance(states[-1], older, newer))
         dr.eval(controls[-1])

@@ -14,7 +14,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.loop import ClosedLoop, OnStep, Step, Trajectory
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
 from mi_nerfattack.system.machine import release_heap
-from mi_nerfattack.vehicle.dynamics import to_state
+from mi_nerfattack.vehicle.dynamics import controls_as, no_control, to_state
 
 #: Images that go back through the policy at once: what it does with one costs more.
 IMAGES = 4
@@ -160,8 +160,8 @@ class Sweep:
         d_state = self.back_blindly(index, step.state, d_after)
         # All that depends on this period's control has been visited: its cotangent
         image = loop.shown(step.observation, index)
-        none = dr.opaque(type(d_state[0]), 0, dr.width(d_state))
-        cotangent = dr.array_t(image)(self.pending.pop(index, none))
+        none = no_control(loop.dynamics.control_size, d_state)
+        cotangent = controls_as(dr.array_t(image), self.pending.pop(index, none))
         dr.eval(cotangent)
         numbers = loop.numbers(step.state, index)
         self._waiting.append((step, image, cotangent, numbers))
@@ -350,10 +350,12 @@ def backward_to_images(
 
 
 def _batch(parts: tuple[Any, ...]) -> Any:
-    """Lay rows, or tensors along their first axis, end to end."""
+    """Lay rows, arrays of rows, or tensors along their first axis, end to end."""
     first = parts[0]
     if len(parts) == 1:
         return first
+    if not dr.is_tensor_v(first) and dr.depth_v(first) == 2:
+        return type(first)(*[_batch(rows) for rows in zip(*parts, strict=True)])
     if not dr.is_tensor_v(first):
         return concat(parts, [dr.width(first)] * len(parts))
     size, shape = dr.width(first.array), (len(parts) * first.shape[0], *first.shape[1:])

@@ -97,7 +97,9 @@ class Varied(AbstractDynamics):
     """A vehicle whose speed and answer to the steering differ from drive to drive.
 
     Another speed changes the heading rate in proportion, so that the path stays, but
-    for `Dubins`, whose control is the heading rate. Other rows of a state stay.
+    for `Dubins`, whose control is the heading rate. Other rows of a state stay: where
+    the speed is one of them, the vehicle goes faster or slower than that row says, at
+    each speed in the same proportion.
 
     Args:
         model: the vehicle.
@@ -114,6 +116,7 @@ class Varied(AbstractDynamics):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "recordable", self.model.recordable)
+        object.__setattr__(self, "control_names", self.model.control_names)
 
     @property
     def state_size(self) -> int:

@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
+from mi_nerfattack.deploy.car import control_names
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.io.overrides import set_keys, tell
@@ -260,6 +261,15 @@ class Scenario(Section):
         policy, taken = self.policy, self.vehicle.unit
         if reason := misfit(policy.unit(), taken, policy.source):
             refuse("vehicle.kind", f"{model} {reason}")
+        car, output = self.vehicle.car(), policy.output
+        given = len(output) if isinstance(output, tuple) else 1
+        names = control_names(car.control_unit, car.more_controls)
+        if given != len(names):
+            refuse(
+                "policy.output",
+                f"says {given} of the policy's numbers; the vehicle takes {len(names)}:"
+                f" {', '.join(names)}; give a column for each",
+            )
         return self
 
     def _check_cameras(self) -> None:

@@ -5,26 +5,40 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from mi_nerfattack.deploy.car import CAR, Car
+from mi_nerfattack.deploy.car import CAR, Car, Control
 from mi_nerfattack.deploy.vehicle import Motion
 from mi_nerfattack.ranges import Count, Finite, Positive, Whole
 from mi_nerfattack.scenario.named_file import AnyCode
-from mi_nerfattack.scenario.section import Kinds, Section, Trust, Unit, refuse
+from mi_nerfattack.scenario.section import (
+    Kinds,
+    OneOrSeveral,
+    Section,
+    Trust,
+    Unit,
+    refuse,
+)
 from mi_nerfattack.vehicle.bicycle import KinematicBicycle, RateLimitedAckermann
-from mi_nerfattack.vehicle.dynamics import AbstractDynamics, Ackermann, Dubins, to_state
+from mi_nerfattack.vehicle.dynamics import (
+    AbstractDynamics,
+    Ackermann,
+    Dubins,
+    to_control,
+    to_state,
+)
 from mi_nerfattack.vehicle.integrators import (
     RK4,
     AbstractIntegrator,
     ExplicitEuler,
     ImplicitMidpoint,
 )
+from mi_nerfattack.vehicle.single_track import DynamicSingleTrack, KinematicSingleTrack
 from mi_nerfattack.vehicle.trial import require_model
-from mi_nerfattack.vehicle.user_model import FunctionDynamics
+from mi_nerfattack.vehicle.user_model import FunctionDynamics, user_controls
 
 INTEGRATORS: dict[str, type[AbstractIntegrator]] = {
     "euler": ExplicitEuler,
@@ -35,6 +49,8 @@ INTEGRATORS: dict[str, type[AbstractIntegrator]] = {
 _STABLE_RATIO = {"euler": 2.0, "rk4": 2.78, "implicit_midpoint": float("inf")}
 #: The same that keeps 6 s of hard steering by rk4 within 1 cm.
 _FINE_RATIO, _MOST_SUBSTEPS = 0.4, 64
+#: The same that keeps a car calm which comes to rest.
+_CALM_RATIO = 2.0
 #: Vehicles with which a user's model is tried.
 TRIALS = 3
 
@@ -82,11 +98,33 @@ class AbstractVehicleSection(Section):
     @property
     def has_expert(self) -> bool:
         """Whether an expert knows what the control does."""
-        return self.unit in ("rad/s", "rad")
+        named = [control.name for control in self.car().more_controls]
+        return self.unit in ("rad/s", "rad") and named in ([], ["acceleration"])
 
     @abstractmethod
     def _handling(self) -> dict[str, Any]:
         """Return what the model says about the car."""
+
+    def _divide(self, key: str, time_s: float, fine_ratio: float) -> None:
+        """Take steps that are fine enough by default, and refuse those that diverge.
+
+        Args:
+            key: that an error names.
+            time_s: smallest time constant of the model, seconds.
+            fine_ratio: of a step and this time, that is fine enough.
+        """
+        fine = math.ceil(self.dt_s / (fine_ratio * time_s) - 1e-9)
+        is_free = "substeps" not in self.model_fields_set and self.integrator == "rk4"
+        if is_free and fine <= _MOST_SUBSTEPS:
+            object.__setattr__(self, "substeps", max(1, fine))  # it is frozen
+        step, limit = self.dt_s / self.substeps, _STABLE_RATIO[self.integrator]
+        if step / time_s >= limit:
+            refuse(
+                key,
+                f"integration steps of dt_s / substeps = {step:g} s diverge "
+                f"with {self.integrator}: they must be below {limit:g} x "
+                f"{time_s:.4g} s; raise substeps",
+            )
 
 
 class DubinsSection(AbstractVehicleSection):
@@ -133,19 +171,8 @@ class AckermannRateSection(AbstractVehicleSection):
 
     @model_validator(mode="after")
     def _check_steps(self) -> Any:
-        """Take steps that are fine enough by default, and refuse those that diverge."""
-        fine = math.ceil(self.dt_s / (_FINE_RATIO * self.steer_time_s) - 1e-9)
-        is_free = "substeps" not in self.model_fields_set and self.integrator == "rk4"
-        if is_free and fine <= _MOST_SUBSTEPS:
-            object.__setattr__(self, "substeps", max(1, fine))  # it is frozen
-        step, limit = self.dt_s / self.substeps, _STABLE_RATIO[self.integrator]
-        if step / self.steer_time_s >= limit:
-            refuse(
-                "steer_time_s",
-                f"integration steps of dt_s / substeps = {step:g} s diverge "
-                f"with {self.integrator}: they must be below {limit:g} x "
-                f"{self.steer_time_s:g} s; raise substeps",
-            )
+        """Take steps that follow the lag."""
+        self._divide("steer_time_s", self.steer_time_s, _FINE_RATIO)
         return self
 
     def build(self) -> AbstractDynamics:
@@ -180,6 +207,93 @@ class BicycleSection(AbstractVehicleSection):
         return _steered(self.front_axle_m + self.rear_axle_m, self.max_steer_deg)
 
 
+class AbstractSingleTrackSection(AbstractVehicleSection):
+    """Controlled by its steering angle and its acceleration; the speed is a state."""
+
+    speed_ms: Positive = 5.0  # at the start; the expert keeps it
+    max_steer_deg: SteerAngle = 34.0
+    max_acceleration_ms2: Positive = 3.0
+    max_brake_ms2: Positive = 8.0
+    stop_speed_ms: Positive = 0.5  # below three times this, brakes fade
+
+    @property
+    @abstractmethod
+    def fastest_rate(self) -> float:
+        """Largest rate of decay of the model, 1/s."""
+
+    @model_validator(mode="after")
+    def _check_steps(self) -> Any:
+        """Take steps that keep the car calm at rest."""
+        self._divide("substeps", 1 / self.fastest_rate, _CALM_RATIO)
+        return self
+
+    def _limits(self) -> tuple[float, float, float, float, float]:
+        steer = math.radians(self.max_steer_deg)  # Dr.Jit takes no NumPy numbers
+        limits = self.max_acceleration_ms2, self.max_brake_ms2, self.stop_speed_ms
+        return self.speed_ms, steer, *limits
+
+    def _accelerated(self, wheelbase: float) -> dict[str, Any]:
+        most, brake = self.max_acceleration_ms2, self.max_brake_ms2
+        more = (Control("acceleration", "m/s^2", -brake, most),)
+        return _steered(wheelbase, self.max_steer_deg) | {"more_controls": more}
+
+
+class KinematicSingleTrackSection(AbstractSingleTrackSection):
+    """Rolls without slip, about its rear axle."""
+
+    kind: Literal["kinematic_single_track"]
+    wheelbase_m: Positive = 2.7
+
+    def build(self) -> AbstractDynamics:
+        """Make the model."""
+        return KinematicSingleTrack(*self._limits(), self.wheelbase_m)
+
+    @property
+    def fastest_rate(self) -> float:
+        """See :class:`AbstractSingleTrackSection`."""
+        return self.max_brake_ms2 / self.stop_speed_ms
+
+    def _handling(self) -> dict[str, Any]:
+        return self._accelerated(self.wheelbase_m)
+
+
+class DynamicSingleTrackSection(AbstractSingleTrackSection):
+    """Has tyres that slip, about its centre of gravity."""
+
+    kind: Literal["dynamic_single_track"]
+    front_axle_m: Positive = 1.35  # from the centre of gravity
+    rear_axle_m: Positive = 1.35
+    mass_kg: Positive = 1400.0
+    yaw_inertia_kgm2: Positive = 2200.0
+    front_stiffness_n_rad: Positive = 80000.0  # of both tyres of an axle
+    rear_stiffness_n_rad: Positive = 80000.0
+    friction: Positive = 0.9
+    low_speed_ms: Positive = 1.0  # around and below it, slip angles are less
+
+    def build(self) -> DynamicSingleTrack:
+        """Make the model."""
+        return DynamicSingleTrack(
+            *self._limits(),
+            self.front_axle_m,
+            self.rear_axle_m,
+            self.mass_kg,
+            self.yaw_inertia_kgm2,
+            self.front_stiffness_n_rad,
+            self.rear_stiffness_n_rad,
+            self.friction,
+            self.low_speed_ms,
+        )
+
+    @property
+    def fastest_rate(self) -> float:
+        """See :class:`AbstractSingleTrackSection`."""
+        return self.build().fastest_rate
+
+    def _handling(self) -> dict[str, Any]:
+        found = self._accelerated(self.front_axle_m + self.rear_axle_m)
+        return found | {"mass": self.mass_kg}
+
+
 class CustomSection(AbstractVehicleSection):
     """A function of the user's."""
 
@@ -188,20 +302,34 @@ class CustomSection(AbstractVehicleSection):
     trust_code: Trust = False  # it runs with all rights of the account
     framework: Literal["drjit", "torch"] = "drjit"  # of the function
     state_size: Annotated[int, Field(ge=3, le=16)] = 3
-    control_limit: Positive  # in the unit of the function's control
+    controls: Annotated[int, Field(ge=1, le=8)] = 1  # of the function
+    control_limit: OneOrSeveral[Positive]  # in the unit of each control
     rest_state: tuple[Finite, ...] = ()  # initial values of the rows after theta
     #: Drives do not depend on these two, only the expert that `evaluate` compares with.
     control_unit: Annotated[Unit | None, Field(exclude=True)] = None
     wheelbase_m: Annotated[Positive | None, Field(exclude=True)] = None
+    later: ClassVar[tuple[str, ...]] = ("controls",)
+
+    @property
+    def limits(self) -> tuple[float, ...]:
+        """The limit of each control."""
+        limit = self.control_limit
+        return limit if isinstance(limit, tuple) else (limit,) * self.controls
 
     @model_validator(mode="after")
-    def _check_rest(self) -> Any:
-        """Refuse initial values of too many or too few rows."""
+    def _check_sizes(self) -> Any:
+        """Refuse initial values and limits of too many or too few numbers."""
         if len(self.rest_state) not in (0, self.state_size - 3):
             refuse(
                 "rest_state",
                 f"has {len(self.rest_state)} numbers; state_size = "
                 f"{self.state_size} needs {self.state_size - 3} or none",
+            )
+        if len(self.limits) != self.controls:
+            refuse(
+                "control_limit",
+                f"has {len(self.limits)} numbers; controls = {self.controls} needs one "
+                "for all, or one for each",
             )
         return self
 
@@ -211,7 +339,7 @@ class CustomSection(AbstractVehicleSection):
         if self.control_unit == "rad":
             if self.wheelbase_m is None:
                 refuse("wheelbase_m", 'is missing; control_unit = "rad" needs it')
-            if self.control_limit >= math.pi / 2:
+            if self.limits[0] >= math.pi / 2:
                 refuse("control_limit", "is no steering angle; must be below pi / 2")
         return self
 
@@ -226,23 +354,28 @@ class CustomSection(AbstractVehicleSection):
         if self.framework == "torch":
             from mi_nerfattack.vehicle.torch_model import TorchDynamics as kind
         function = self.function.load("vehicle.function", self.trust_code)
-        limit = self.control_limit
-        dynamics = kind(function, self.state_size, limit, self.rest_state)
+        limit = self.limits[0] if self.controls == 1 else self.limits
+        how = self.state_size, limit, self.rest_state, self.controls
+        dynamics = kind(function, *how)
         rng = np.random.default_rng(0)
         states = dynamics.extend(rng.normal(size=(TRIALS, 3)))
         # Off the initial values of the other rows: there a model may have a kink.
         states[:, 3:] += 1e-3 * rng.uniform(0.5, 1, (TRIALS, self.state_size - 3))
         state = to_state(states)
-        control = type(state[0])(limit * rng.uniform(0.1, 0.5, TRIALS))
+        shares = rng.uniform(0.1, 0.5, (self.controls, TRIALS))
+        control = to_control(shares.T * self.limits)
         require_model(dynamics.name, dynamics, state, control)
         return dynamics
 
     def _handling(self) -> dict[str, Any]:
-        limit, wheelbase = self.control_limit, self.wheelbase_m
+        (limit, *others), wheelbase = self.limits, self.wheelbase_m
         steered = {"max_steer": limit} if self.control_unit == "rad" else {}
         sizes = {} if wheelbase is None else {"wheelbase": wheelbase}
         unit = self.control_unit or "other"
-        return {"max_control": limit, "control_unit": unit, **steered, **sizes}
+        pairs = zip(user_controls(self.controls)[1:], others, strict=True)
+        more = [Control(name, "other", -most, most) for name, most in pairs]
+        found = {"max_control": limit, "control_unit": unit, **steered, **sizes}
+        return found | {"more_controls": tuple(more)}
 
 
 def _steered(wheelbase: float, max_steer_deg: float) -> dict[str, Any]:
@@ -260,6 +393,8 @@ VehicleSection = Annotated[
     | AckermannSection
     | AckermannRateSection
     | BicycleSection
+    | KinematicSingleTrackSection
+    | DynamicSingleTrackSection
     | CustomSection,
     Kinds("dubins"),
 ]

@@ -98,7 +98,7 @@ class FrameDataset:
         frames: (n_k, height, width, 3) uint8 sRGB for each shard, in memory or on the
             disk.
         goals: (sum n_k,) int64.
-        controls: (sum n_k,) float32, rad/s.
+        controls: (sum n_k,) float32, rad/s or rad; (sum n_k, j) of j > 1 controls.
     """
 
     frames: tuple[np.ndarray | FramesFile, ...]
@@ -110,13 +110,14 @@ class FrameDataset:
         count = sum(len(array) for array in self.frames)
         if len(shapes) != 1 or any(array.dtype != np.uint8 for array in self.frames):
             raise InputError(f"frames: uint8 of one shape are needed, not {shapes}")
-        if count == 0 or {self.goals.shape, self.controls.shape} != {(count,)}:
+        shapes = {self.goals.shape, self.controls.shape[:1]}
+        if count == 0 or shapes != {(count,)} or self.controls.ndim > 2:
             raise InputError(
                 f"dataset: {count} frames, goals {self.goals.shape}, controls "
                 f"{self.controls.shape}; at least one row, and as many of each"
             )
         if not np.isfinite(self.controls).all():
-            row = int(np.argmin(np.isfinite(self.controls)))
+            row = int(np.argwhere(~np.isfinite(self.controls))[0, 0])
             raise InputError(
                 f"controls: row {row} is {self.controls[row]}; finite only"
             )
@@ -209,7 +210,7 @@ def shard_columns(
     Args:
         frames: (n, height, width, 3) uint8, sRGB.
         goals: (n,) integers.
-        controls: (n,) rad/s or rad.
+        controls: (n,) rad/s or rad; (n, j) of j > 1 controls.
         states: of the vehicle; None where nothing but controls is imitated.
 
     Raises:

@@ -27,7 +27,7 @@ from mi_nerfattack.training.dataset import (
 from mi_nerfattack.training.settings import ImitationSettings
 from mi_nerfattack.training.sources import AbstractSource, PolicyDrives
 from mi_nerfattack.training.staging import ROADSIDE, AbstractStaging
-from mi_nerfattack.training.train import Progress, check_labels, fit_policy
+from mi_nerfattack.training.train import Progress, check_labels, check_site, fit_policy
 from mi_nerfattack.training.validation import ClosedLoop, Epoch, rank
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -322,7 +322,7 @@ def _check_policy(
                 f"{MOST_GOALS} goals, from 0: number the manoeuvres closely"
             )
     for site in sites:
-        check_camera(site)
+        check_site(site)
     size = settings.collecting.shard
     count = len(more) + sum(-(-n // size) for n in settings.frames.values())
     if settings.holds_out_shards and count < 2:
@@ -356,18 +356,6 @@ def _check_places(
     # what cannot be made is told now, not after the hours of those before it
     for site in sites:
         site.open(site.typical()).close()
-
-
-def check_camera(site: AbstractSite) -> None:
-    """Raise `InputError` unless PilotNet takes the images of a site's camera."""
-    height, width = IMAGE_SHAPE
-    if site.rig.size != (width, height):
-        wide, high = site.rig.size
-        raise InputError(
-            f"camera of {site.name!r}: {wide} x {high} px; PilotNet "
-            f"takes {width} x {height}: change the camera, or collect frames alone "
-            "('mi-nerfattack train --frames-only') and train your own network"
-        )
 
 
 def _check_frames(module: PilotNet, shards: Sequence[Path]) -> None:

@@ -25,13 +25,13 @@ class Labelled(NamedTuple):
 
     Args:
         image: (height, width, 3), uint8 sRGB.
-        control: the expert's, in the unit of the vehicle.
+        control: the expert's, in the unit of the vehicle; (k,) of k > 1 controls.
         pose: (3,) of the vehicle, x and y in metres, heading in radians.
         step: control periods since the drive began; 0 begins another drive.
     """
 
     image: np.ndarray
-    control: float
+    control: float | np.ndarray
     pose: np.ndarray
     step: int
 
@@ -86,7 +86,8 @@ class Scenery:
     def label(self, image: np.ndarray, step: int) -> Labelled:
         """Add the vehicle's pose and the expert's control to the image of a step."""
         state = self.environment.state
-        control = float(self.expert.control(state)[0])
+        found = self.expert.control(state)
+        control = float(found[0]) if found.ndim == 1 else found[0]
         return Labelled(image, control, np.array(state[:3], np.float64), step)
 
     @property

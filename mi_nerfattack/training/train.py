@@ -12,9 +12,10 @@ import numpy as np
 import torch
 
 from mi_nerfattack.backend.versions import versions
+from mi_nerfattack.deploy.sites import AbstractSite
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io.resumable import Record, Unit, array_digest, flatten
-from mi_nerfattack.policy.pilotnet import PilotNet
+from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, PilotNet
 from mi_nerfattack.ranges import Count, Fraction, checked
 from mi_nerfattack.training.augment import Augmentation
 from mi_nerfattack.training.dataset import FrameDataset
@@ -312,9 +313,33 @@ def check_labels(module: PilotNet, data: FrameDataset) -> None:
     low, high = int(data.goals.min()), int(data.goals.max())
     if low < 0 or high >= module.goals:
         raise InputError(f"goals: {low} to {high}; at least 0 and below {module.goals}")
+    if data.controls.ndim > 1:
+        raise InputError(
+            f"controls: {data.controls.shape[1]} of each frame; PilotNet gives one: "
+            "train a network of your own on these frames"
+        )
     largest: Any = np.abs(data.controls).max()
     # rounded alike: NumPy 1 compares in double precision
     if largest > np.float32(module.max_control):
         raise InputError(
             f"controls: up to {largest:.3g} rad/s; at most {module.max_control}"
+        )
+
+
+def check_site(site: AbstractSite) -> None:
+    """Raise `InputError` unless PilotNet takes a site's images, and drives its car."""
+    if more := site.car.more_controls:
+        names = ", ".join(control.name for control in more)
+        raise InputError(
+            f"car of {site.name!r}: takes {names} besides its steering; PilotNet gives "
+            "the steering alone: collect frames alone ('mi-nerfattack train "
+            "--frames-only') and train your own network"
+        )
+    height, width = IMAGE_SHAPE
+    if site.rig.size != (width, height):
+        wide, high = site.rig.size
+        raise InputError(
+            f"camera of {site.name!r}: {wide} x {high} px; PilotNet takes {width} x "
+            f"{height}: change the camera, or collect frames alone ('mi-nerfattack "
+            "train --frames-only') and train your own network"
         )

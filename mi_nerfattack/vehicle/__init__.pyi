@@ -10,5 +10,7 @@ from .integrators import ImplicitMidpoint as ImplicitMidpoint
 from .route.route import Route as Route
 from .route.route import load_routes as load_routes
 from .route.route import smooth_absolute as smooth_absolute
+from .single_track import DynamicSingleTrack as DynamicSingleTrack
+from .single_track import KinematicSingleTrack as KinematicSingleTrack
 from .torch_model import TorchDynamics as TorchDynamics
 from .user_model import FunctionDynamics as FunctionDynamics

@@ -3,13 +3,17 @@
 A state is a Dr.Jit array of m rows, `(px, py, theta, ...)` in metres and radians,
 theta counter-clockwise from +x; each row holds the n vehicles of a batch. Any
 floating-point type of any backend works (`Array3f`, `Array3f64`, for m > 3 `ArrayXf64`;
-LLVM or CUDA, with or without derivatives). A control is one such row, (n,).
+LLVM or CUDA, with or without derivatives).
+
+A vehicle takes one control, a row (n,), or k > 1 of them, an array of k rows (k, n) of
+the type `ArrayXf64`, in the order of its `control_names`.
 """
 
 from __future__ import annotations
 
 import sys
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -18,6 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.backend.arrays import upload_rows
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Acute, Positive, checked
 
 
@@ -43,7 +48,75 @@ def to_state(states: np.ndarray) -> Any:
     return result
 
 
-def soft_limit(value: Any, limit: float) -> Any:
+def to_control(values: np.ndarray) -> Any:
+    """Upload controls (n, k) of n vehicles, opaque: (n,) if k = 1, otherwise (k, n)."""
+    row = dr.value_t(state_type())
+    rows = [row(column) for column in np.asarray(values, np.float64).T.tolist()]
+    result = rows[0] if len(rows) == 1 else _rows_t(row)(*rows)
+    dr.make_opaque(result)
+    return result
+
+
+def controls_as(row: Any, controls: Any) -> Any:
+    """Convert the controls of n vehicles to another precision.
+
+    Args:
+        row: type of one control, such as `mi.Float` or `mi.Float64`.
+        controls: (n,) or (k, n); Dr.Jit, any float type.
+
+    Returns:
+        (n,) or, of k > 1 controls, (k, n).
+    """
+    if dr.depth_v(controls) == 1:
+        return row(controls)
+    rows = [row(item) for item in controls]
+    return rows[0] if len(rows) == 1 else _rows_t(row)(*rows)
+
+
+def no_control(size: int, like: Any) -> Any:
+    """Return the control 0 of vehicles that take `size`, opaque.
+
+    Args:
+        size: number of controls.
+        like: any state (m, n).
+
+    Returns:
+        (n,) or (size, n), detached.
+    """
+    row = dr.detached_t(type(like[0]))
+    rows = [dr.opaque(row, 0, dr.width(like)) for _ in range(size)]
+    return rows[0] if size == 1 else _rows_t(row)(*rows)
+
+
+def control_size(control: Any) -> int:
+    """Return the number of controls in (n,) or (k, n)."""
+    return 1 if dr.depth_v(control) == 1 else len(control)
+
+
+def _rows_t(row: Any) -> Any:
+    """Type of an array of any number of rows: `ArrayXf64` for a row `Float64`."""
+    return getattr(sys.modules[row.__module__], _ROWS[dr.type_v(row)])
+
+
+_ROWS = {dr.VarType.Float32: "ArrayXf", dr.VarType.Float64: "ArrayXf64"}
+
+
+def require_controls(given: int, names: Sequence[str]) -> None:
+    """Raise `InputError` unless a policy gives as many controls as its vehicle takes.
+
+    Args:
+        given: number of controls of an image.
+        names: of the controls that the vehicle takes.
+    """
+    if given != len(names):
+        raise InputError(
+            f"controls: the policy gives {given}, the vehicle takes {len(names)}: "
+            f"{', '.join(names)}; let the policy return so many, in this order, or "
+            "take another vehicle"
+        )
+
+
+def soft_limit(value: Any, limit: Any) -> Any:
     """Limit a value smoothly: `x / (1 + (x/limit)^8)^(1/8)`.
 
     The function is odd, strictly increasing, equal to its argument within 0.05 % up
@@ -54,7 +127,7 @@ def soft_limit(value: Any, limit: float) -> Any:
 
     Args:
         value: Dr.Jit array, any shape, in the unit of `limit`.
-        limit: positive bound that the result approaches.
+        limit: positive bound that the result approaches; a number, or an array.
 
     Returns:
         Array of the same shape, between -limit and limit.
@@ -69,7 +142,7 @@ def soft_limit(value: Any, limit: float) -> Any:
 
 @dataclass(frozen=True)
 class AbstractDynamics(ABC):
-    """Continuous-time vehicle model `dx/dt = f(x, u)` with a scalar control.
+    """Continuous-time vehicle model `dx/dt = f(x, u)` with one or several controls.
 
     Write your own by giving `derivative` and `saturate` in Dr.Jit operations; every
     derivative that the adjoint needs follows from automatic differentiation.
@@ -77,9 +150,17 @@ class AbstractDynamics(ABC):
     Attributes:
         recordable: whether `derivative` consists of Dr.Jit operations alone, so that
             `drjit.freeze` can record it; false where it calls another library.
+        control_names: of the controls, in their order: "heading_rate" (rad/s),
+            "steering" (rad), "acceleration" (m/s^2), or names of your own.
     """
 
     recordable: ClassVar[bool] = True
+    control_names: ClassVar[tuple[str, ...]] = ("control",)
+
+    @property
+    def control_size(self) -> int:
+        """Number k of controls."""
+        return len(self.control_names)
 
     @property
     def state_size(self) -> int:
@@ -104,18 +185,34 @@ class AbstractDynamics(ABC):
 
         Args:
             state: (m, n), metres and radians.
-            control: (n,), within its limits: call `saturate` before.
+            control: (n,), or (k, n) of k > 1, within its limits: call `saturate`
+                before.
 
         Returns:
             (m, n), metres per second and radians per second.
         """
+
+    def speed_of(self, state: Any) -> Any:
+        """Return the speeds (n,) along the heading, m/s, negative in reverse.
+
+        By default those of `derivative` without a control; differentiable.
+
+        Args:
+            state: (m, n), metres and radians.
+        """
+        row = dr.zeros(dr.detached_t(type(state[0])), dr.width(state))
+        several = self.control_size > 1
+        control = _rows_t(type(row))(*[row] * self.control_size) if several else row
+        slope = self.derivative(state, control)
+        sin, cos = dr.sincos(state[2])
+        return cos * slope[0] + sin * slope[1]
 
     def jacobian(self, state: Any, control: Any) -> list[Any]:
         """Compute df/dx by forward-mode differentiation.
 
         Args:
             state: (m, n), treated as a constant.
-            control: (n,), treated as a constant.
+            control: (n,) or (k, n), treated as a constant.
 
         Returns:
             m columns, each (m, n): column j is df/dx_j, detached.
@@ -136,16 +233,14 @@ class AbstractDynamics(ABC):
 
     @abstractmethod
     def saturate(self, control: Any) -> Any:
-        """Limit a commanded control (n,) smoothly to what the vehicle can do."""
+        """Limit a commanded control smoothly to what the vehicle can do.
 
-    def speed_of(self, state: Any) -> Any:
-        """Return speeds (n,) along the headings of states (m, n), m/s; signed.
+        Args:
+            control: (n,), or (k, n) of k > 1.
 
-        Differentiable; with the control 0, which moves no vehicle at once.
+        Returns:
+            of the same shape.
         """
-        slope = self.derivative(state, dr.zeros(type(state[0]), dr.width(state)))
-        sin, cos = dr.sincos(state[2])
-        return slope[0] * cos + slope[1] * sin
 
     def numbered(self, first: int) -> AbstractDynamics:
         """Return this model with another number of the first drive of each batch.
@@ -176,17 +271,19 @@ class Dubins(AbstractDynamics):
     `dx/dt = (v cos theta, v sin theta, u)`. Source: appendix A.7.
 
     Args:
-        speed: v, metres per second.
+        speed_ms: v, metres per second.
         max_heading_rate: limit of ``|u|``, radians per second.
     """
 
-    speed: Positive = 5.0
+    speed_ms: Positive = 5.0
     max_heading_rate: Positive = 1.5
+
+    control_names: ClassVar[tuple[str, ...]] = ("heading_rate",)
 
     def derivative(self, state: Any, control: Any) -> Any:
         """Compute (3, n) from state (3, n) and heading rate (n,) in rad/s."""
         sin, cos = dr.sincos(state[2])
-        return type(state)(self.speed * cos, self.speed * sin, control)
+        return type(state)(self.speed_ms * cos, self.speed_ms * sin, control)
 
     def saturate(self, control: Any) -> Any:
         """Limit the heading rate (n,) with `soft_limit`."""
@@ -203,20 +300,22 @@ class Ackermann(AbstractDynamics):
     equation has that of the heading.
 
     Args:
-        speed: v, metres per second.
+        speed_ms: v, metres per second.
         wheelbase: l, metres.
         max_steer: limit of ``|u|``, radians, below pi/2.
     """
 
-    speed: Positive = 5.0
+    speed_ms: Positive = 5.0
     wheelbase: Positive = 2.7
     max_steer: Acute = 0.6
+
+    control_names: ClassVar[tuple[str, ...]] = ("steering",)
 
     def derivative(self, state: Any, control: Any) -> Any:
         """Compute (3, n) from state (3, n) and steering angle (n,) in radians."""
         sin, cos = dr.sincos(state[2])
-        heading_rate = self.speed / self.wheelbase * dr.tan(control)
-        return type(state)(self.speed * cos, self.speed * sin, heading_rate)
+        heading_rate = self.speed_ms / self.wheelbase * dr.tan(control)
+        return type(state)(self.speed_ms * cos, self.speed_ms * sin, heading_rate)
 
     def saturate(self, control: Any) -> Any:
         """Limit the steering angle (n,) with `soft_limit`."""

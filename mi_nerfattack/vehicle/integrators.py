@@ -18,7 +18,7 @@ from mi_nerfattack.backend.arrays import vjp
 from mi_nerfattack.backend.freeze import freeze_method
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Count, checked
-from mi_nerfattack.vehicle.dynamics import AbstractDynamics
+from mi_nerfattack.vehicle.dynamics import AbstractDynamics, no_control
 
 
 def solve_columns(columns: list[Any], right: Any) -> Any:
@@ -82,7 +82,7 @@ class AbstractIntegrator(ABC):
         Args:
             dynamics: vehicle model.
             x: (m, n) state, metres and radians, m the model's `state_size`.
-            u: (n,) control held over the step, already saturated.
+            u: (n,) or (k, n) control held over the step, already saturated.
             dt: seconds.
 
         Returns:
@@ -248,14 +248,14 @@ class Transition:
     def controls(
         self, controls: Sequence[Any], period: int, like: Any
     ) -> tuple[Any, ...]:
-        """Pick the older and the newer control (n,) out of a drive's.
+        """Pick the older and the newer control out of a drive's.
 
         Args:
-            controls: raw controls of the periods 0 to `period`, rows (n,).
+            controls: raw controls of the periods 0 to `period`, (n,) or (k, n).
             period: index.
             like: any state of the drive.
         """
-        none = dr.opaque(dr.detached_t(type(like[0])), 0, dr.width(like))
+        none = no_control(self.dynamics.control_size, like)
         return tuple(controls[i] if i >= 0 else none for i in self.sources(period))
 
     def advance(self, state: Any, older: Any, newer: Any) -> Any:

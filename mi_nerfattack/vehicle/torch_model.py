@@ -27,12 +27,15 @@ class TorchDynamics(AbstractUserDynamics):
     be written in Dr.Jit operations.
 
     Args:
-        function: maps a state (n, m) and a control (n,), within its limit, both on
-            the device and in the precision of the loop, to the derivative (n, m). It
-            treats each vehicle alone, and changes nothing between two calls.
+        function: maps a state (n, m) and a control (n,), or several (n, k), within
+            its limit, both on the device and in the precision of the loop, to the
+            derivative (n, m). It treats each vehicle alone, and changes nothing between
+            two calls.
         size: m, at least 3; the first columns are px, py, theta.
-        limit: of ``|control|``, in its unit; applied by `soft_limit`.
+        limit: of ``|control|``, in its unit; applied by `soft_limit`. Of several
+            controls one for all, or one for each.
         rest: initial values of the m - 3 columns after theta; zeros if left out.
+        controls: k, their number.
     """
 
     recordable: ClassVar[bool] = False
@@ -60,7 +63,7 @@ class TorchDynamics(AbstractUserDynamics):
         return [_to_state(column, state) for column in torch.stack(rows, 1).unbind(2)]
 
     def evaluate(self, state: torch.Tensor, control: torch.Tensor) -> torch.Tensor:
-        """Call the function with (n, m) and (n,), and check what it returned."""
+        """Call the function with (n, m) and (n,) or (n, k), and check its result."""
         result = call_model(self.name, self.function, state, control)
         if not isinstance(result, torch.Tensor) or result.shape != state.shape:
             shape = getattr(result, "shape", None)
@@ -77,7 +80,7 @@ class TorchDynamics(AbstractUserDynamics):
     def vjp(
         self, state: torch.Tensor, control: torch.Tensor, cotangent: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Multiply (n, m) by the derivatives: (n, m) and (n,)."""
+        """Multiply (n, m) by the derivatives: (n, m), and (n,) or (n, k)."""
         result, leaves = self._graph(state, control)
         return self._reverse(result, leaves, cotangent)
 
@@ -88,7 +91,7 @@ class TorchDynamics(AbstractUserDynamics):
         d_state: torch.Tensor,
         d_control: torch.Tensor,
     ) -> torch.Tensor:
-        """Multiply the derivatives by (n, m) and (n,): (n, m).
+        """Multiply the derivatives by (n, m), and (n,) or (n, k): (n, m).
 
         By a reverse pass a column, so that every function of autograd will do.
         """
@@ -97,7 +100,9 @@ class TorchDynamics(AbstractUserDynamics):
         for unit in torch.eye(self.size).to(result):
             rows = unit.expand_as(result)
             by_state, by_control = self._reverse(result, leaves, rows)
-            columns.append((by_state * d_state).sum(1) + by_control * d_control)
+            product = by_control * d_control
+            by_all = product if product.ndim == 1 else product.sum(1)
+            columns.append((by_state * d_state).sum(1) + by_all)
         return torch.stack(columns, 1)
 
     def _graph(
@@ -156,14 +161,17 @@ class _Derivative(dr.CustomOp):
         point = _tensors(self.state, self.control)
         by_state, by_control = self.dynamics.vjp(*point, cotangent)
         self.set_grad_in("state", _to_state(by_state, self.state))
-        self.set_grad_in("control", _to_row(by_control, type(self.control)))
+        if by_control.ndim == 1:
+            self.set_grad_in("control", _to_row(by_control, type(self.control)))
+        else:
+            self.set_grad_in("control", _to_state(by_control, self.control))
 
     def name(self) -> str:
         return self.dynamics.name
 
 
 def _tensors(state: Any, control: Any) -> tuple[torch.Tensor, torch.Tensor]:
-    """Copy a state (m, n) as (n, m), and a control (n,)."""
+    """Copy a state (m, n) as (n, m), and a control (n,), or (k, n) as (n, k)."""
     count = dr.width(state, control)
     return _to_columns(state, count), _to_columns(control, count)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import drjit as dr
@@ -28,7 +29,7 @@ def require_model(name: str, dynamics: AbstractDynamics, state: Any, u: Any) -> 
         name: of the model, for messages.
         dynamics: the model.
         state: (m, n), n >= 2, double precision, away from kinks.
-        u: (n,) control within its limit.
+        u: (n,) or (k, n) control within its limit.
 
     Raises:
         InputError: values or derivatives are not finite, a derivative is lost, or one
@@ -36,16 +37,19 @@ def require_model(name: str, dynamics: AbstractDynamics, state: Any, u: Any) -> 
     """
     value = _values(dynamics, state, u)
     require_finite(name, value.T)
-    alone = _values(dynamics, type(state)(*[_first(row) for row in state]), _first(u))
+    alone = _values(dynamics, _first(state), _first(u))
     if not np.allclose(alone[:, 0], value[:, 0], rtol=1e-9, atol=1e-12):
         raise InputError(
             f"{name}: gave {value[:, 0].tolist()} for a vehicle among others and "
             f"{alone[:, 0].tolist()} for it alone; vehicles must not mix"
         )
-    columns = [*dynamics.jacobian(state, u), _by_control(dynamics, state, u)]
+    columns = [*dynamics.jacobian(state, u), *_by_controls(dynamics, state, u)]
+    size = len(state)
     for j, column in enumerate(columns):
         found = np.broadcast_to(column.numpy(), value.shape)
-        source = "the control" if j == len(state) else f"row {j} of the state"
+        source = (
+            f"row {j} of the state" if j < size else _control_name(dynamics, j - size)
+        )
         if not np.isfinite(found).all():
             raise InputError(
                 f"{name}: its derivative by {source} is {found[:, 0].tolist()}; finite "
@@ -68,27 +72,47 @@ def _values(dynamics: AbstractDynamics, state: Any, u: Any) -> np.ndarray:
     return np.array(np.broadcast_to(value, (len(state), dr.width(state))))
 
 
-def _by_control(dynamics: AbstractDynamics, state: Any, u: Any) -> Any:
-    """Compute df/du, (m, n), in forward mode."""
-    with dr.resume_grad():
-        leaf = type(u)(dr.detach(u))
-        dr.enable_grad(leaf)
-        slope = dynamics.derivative(dr.detach(state), leaf)
-        dr.set_grad(leaf, 1)
-        flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
-        return dr.detach(dr.forward_to(slope, flags=flags))
+def _control_name(dynamics: AbstractDynamics, index: int) -> str:
+    """Name a control for a message."""
+    single = dynamics.control_size == 1
+    return "the control" if single else f"control {index}"
+
+
+def _rows(control: Any) -> list[Any]:
+    """Return the rows of controls (n,) or (k, n)."""
+    return [control] if dr.depth_v(control) == 1 else list(control)
+
+
+def _joined(rows: list[Any], like: Any) -> Any:
+    """Undo `_rows`."""
+    return rows[0] if dr.depth_v(like) == 1 else type(like)(*rows)
+
+
+def _by_controls(dynamics: AbstractDynamics, state: Any, u: Any) -> Iterator[Any]:
+    """Compute df/du of each control, (m, n), in forward mode."""
+    for index in range(dynamics.control_size):
+        with dr.resume_grad():
+            rows = [type(row)(dr.detach(row)) for row in _rows(u)]
+            dr.enable_grad(rows[index])
+            slope = dynamics.derivative(dr.detach(state), _joined(rows, u))
+            dr.set_grad(rows[index], 1)
+            flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
+            yield dr.detach(dr.forward_to(slope, flags=flags))
 
 
 def _difference(dynamics: AbstractDynamics, state: Any, u: Any, row: int) -> np.ndarray:
-    """Compute one column of the derivatives, (m, n); the last is the control's."""
-    ends = []
+    """Compute one column of the derivatives, (m, n); the last are the controls'."""
+    ends, size = [], len(state)
     for sign in (1, -1):
-        rows = [type(u)(item) for item in (*state, u)]
+        rows = [type(item)(item) for item in (*state, *_rows(u))]
         step = STEP * (1 + np.abs(rows[row].numpy()))
-        rows[row] += type(u)(sign * step)
-        ends.append(_values(dynamics, type(state)(*rows[:-1]), rows[-1]) / (2 * step))
+        rows[row] += type(rows[row])(sign * step)
+        moved = type(state)(*rows[:size]), _joined(rows[size:], u)
+        ends.append(_values(dynamics, *moved) / (2 * step))
     return ends[0] - ends[1]
 
 
-def _first(row: Any) -> Any:
-    return type(row)(row.numpy()[:1])
+def _first(array: Any) -> Any:
+    """Return the first vehicle of rows (n,) or (k, n)."""
+    rows = [type(row)(row.numpy()[:1]) for row in _rows(array)]
+    return _joined(rows, array)

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from mi_nerfattack.errors import InputError, is_interrupt
-from mi_nerfattack.ranges import Positive, checked
+from mi_nerfattack.ranges import Count, Positive, checked
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics, soft_limit
 
 
@@ -24,10 +24,17 @@ class AbstractUserDynamics(AbstractDynamics):
 
     function: Callable[[Any, Any], Any]
     size: Annotated[int, Field(ge=3)] = 3
-    limit: Positive = 1.0
+    limit: Positive | tuple[Positive, ...] = 1.0
     rest: tuple[float, ...] = ()
+    controls: Count = 1
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "control_names", user_controls(self.controls))
+        if isinstance(self.limit, tuple) and len(self.limit) != self.controls:
+            raise InputError(
+                f"{type(self).__name__}.limit: {self.limit!r}; one number, or "
+                f"{self.controls} numbers, one for each control"
+            )
         more = self.size - 3
         if len(self.rest) not in (0, more) or not np.isfinite(self.rest).all():
             raise InputError(
@@ -50,8 +57,13 @@ class AbstractUserDynamics(AbstractDynamics):
         return append_rows(poses, self.rest or (0.0,) * (self.size - 3))
 
     def saturate(self, control: Any) -> Any:
-        """Limit the control (n,) with `soft_limit`."""
-        return soft_limit(control, self.limit)
+        """Limit the control (n,), or each of (k, n), with `soft_limit`."""
+        limits = self.limit if isinstance(self.limit, tuple) else (self.limit,)
+        if self.controls == 1:
+            return soft_limit(control, limits[0])
+        limits *= self.controls // len(limits)
+        pairs = zip(control, limits, strict=True)
+        return type(control)(*[soft_limit(row, limit) for row, limit in pairs])
 
 
 @dataclass(frozen=True)
@@ -68,13 +80,16 @@ class FunctionDynamics(AbstractUserDynamics):
     4
 
     Args:
-        function: maps a state (m, n) and a control (n,), within its limit, to the
-            m rows of the derivative, in Dr.Jit operations: an array of the state's
-            type, or a list or tuple of rows. It treats each vehicle alone and reads
-            nothing that changes, for it is called once and its kernels are recorded.
+        function: maps a state (m, n) and a control (n,), or several (k, n), within
+            its limit, to the m rows of the derivative, in Dr.Jit operations: an array
+            of the state's type, or a list or tuple of rows. It treats each vehicle
+            alone and reads nothing that changes, for it is called once and its kernels
+            are recorded.
         size: m, at least 3; the first rows are px, py, theta.
-        limit: of ``|control|``, in its unit; applied by `soft_limit`.
+        limit: of ``|control|``, in its unit; applied by `soft_limit`. Of several
+            controls one for all, or one for each.
         rest: initial values of the m - 3 rows after theta; zeros if left out.
+        controls: k, their number.
     """
 
     def derivative(self, state: Any, control: Any) -> Any:
@@ -122,6 +137,11 @@ class FunctionDynamics(AbstractUserDynamics):
             f"{self.name}: returned {found}; {self.size} rows are needed, one number "
             "for each vehicle"
         )
+
+
+def user_controls(count: int) -> tuple[str, ...]:
+    """Name the controls of a user's model: "control", or "control_0", ..."""
+    return ("control",) if count == 1 else tuple(f"control_{i}" for i in range(count))
 
 
 def describe_function(function: Callable[..., Any]) -> str:

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 FOUND = {name: findings_in(name, path) for name, path in pages().items()}
 # Pages that do not pass yet, with their number of findings; it may only fall.
 PENDING = {
-    "docs/attack.md": 71,
+    "docs/attack.md": 70,
     "docs/environments.md": 26,
     "docs/fields.md": 66,
     "docs/formats.md": 2,

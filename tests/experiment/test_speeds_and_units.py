@@ -18,6 +18,11 @@ import drjit as dr
 def car(state, control):
     _, _, theta, speed = state
     return speed * dr.cos(theta), speed * dr.sin(theta), control, speed - speed
+
+
+def forced(state, control):
+    *moved, _ = car(state, control[0])
+    return *moved, control[1]
 """
 CUSTOM = """[vehicle]
 kind = "custom"
@@ -27,6 +32,7 @@ state_size = 4
 control_limit = 1.5
 rest_state = [9.0]
 """
+FORCED = CUSTOM.replace("car.py:car", "car.py:forced") + "controls = 2\n"
 
 
 @pytest.mark.parametrize(
@@ -36,6 +42,7 @@ rest_state = [9.0]
         ("[vehicle]\nspeed_ms = 8", "horizon = 4", ["8", "5", "4", "3.2", "4", "2.0"]),
         ("[vehicle]\nspeed_ms = 8", "length_m = 4", ["8", "5", "5", "4.0", "8", "4.0"]),
         (CUSTOM, "length_m = 4", ["9", "5", "8", "7.2", "8", "4.0"]),
+        (FORCED, "length_m = 4", ["9", "5", "8", "7.2", "8", "4.0"]),
         (CUSTOM.replace("9.0", "5.0"), "length_m = 4", []),
     ],
 )
@@ -45,6 +52,8 @@ def test_speeds_of_vehicle_and_route(scenario_folder, vehicle, drive, numbers):
     text = (scenario_folder / "scenario.toml").read_text()
     assert "horizon = 4" in text
     path = scenario_folder / "speeds.toml"
+    if vehicle == FORCED:
+        text = text.replace("[policy]", "[policy]\noutput = [0, 1]")
     path.write_text(text.replace("horizon = 4", drive) + vehicle)
     scenario, _ = load_scenario(path)
     found = " ".join(speed_findings(build_world(scenario, scenario.build_policy())))

@@ -212,3 +212,24 @@ def test_a_module_says_how_it_takes_the_goal(line, goal, tmp_path):
     module.goals = nn.Linear(3, 4)
     with pytest.raises(InputError, match=r"Module\.goals: a Linear"):
         TorchPolicy(module)
+
+
+def test_several_controls_are_rows_and_go_back(rng):
+    """Columns in any order, each with a scale; the derivative is autograd's."""
+    weight = torch.randn(3, 3, generator=torch.Generator().manual_seed(1))
+    made = policy(
+        lambda x: x.mean((2, 3)) @ weight, output=(2, 0), control_scale=(2.0, -0.5)
+    )
+    image = images(rng)
+    rows = made.control(image, 0)
+    means = torch.tensor(image.numpy().mean((1, 2)))
+    expected = (means @ weight)[:, [2, 0]] * torch.tensor([2.0, -0.5])
+    assert type(rows) is mi.ArrayXf and rows.shape == (2, 2)
+    np.testing.assert_allclose(rows.numpy().T, expected.numpy(), rtol=1e-5)
+    cotangent = mi.ArrayXf([1.0, 0.0], [0.0, 3.0])
+    found = made.step_vjp(image, 0, (), cotangent, ())[0].numpy()
+    by_mean = np.stack([2 * weight[:, 2].numpy(), -1.5 * weight[:, 0].numpy()])
+    expected = np.broadcast_to(by_mean[:, None, None] / np.prod(SIZE), found.shape)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    with pytest.raises(InputError, match=r"output \(is \(3, 0\)\)"):
+        policy(lambda x: x.mean((2, 3)), output=(3, 0)).control(image, 0)

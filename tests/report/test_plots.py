@@ -13,7 +13,7 @@ from support.pages.read import drawn
 from support.worlds.places import write_place
 
 from mi_nerfattack.deploy.surrogate.scene import field_sensor
-from mi_nerfattack.drives.table import STATE_ROWS, STEPS, read_csv, write_steps
+from mi_nerfattack.drives.table import FURTHER, STEPS, read_csv, write_steps
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation import metrics
 from mi_nerfattack.fields.io import load_field
@@ -189,7 +189,7 @@ def test_steps_hold_all_rows_of_the_state(tmp_path):
     states = np.arange(10.0).reshape(2, 5)
     drives = [make_drive([0.1, -0.9]), make_drive([0.2], case="own", states=states)]
     write_steps(tmp_path / "steps.csv", drives, LANES)
-    table = read_csv(tmp_path / "steps.csv", STEPS, STATE_ROWS)
+    table = read_csv(tmp_path / "steps.csv", STEPS, FURTHER)
     assert list(table.columns[len(STEPS) :]) == ["state_3", "state_4"]
     more = table[["state_3", "state_4"]].to_numpy()
     np.testing.assert_array_equal(more, [[np.nan] * 2, [np.nan] * 2, [8, 9]])

@@ -20,7 +20,8 @@ from mi_nerfattack.rollout.loop import ClosedLoop, simulate
 from mi_nerfattack.rollout.scene_sensor import SceneSensor
 from mi_nerfattack.rollout.variation import Variation, Varied
 from mi_nerfattack.vehicle.bicycle import RateLimitedAckermann
-from mi_nerfattack.vehicle.dynamics import Ackermann, Dubins, to_state
+from mi_nerfattack.vehicle.dynamics import Ackermann, Dubins, to_control, to_state
+from mi_nerfattack.vehicle.single_track import KinematicSingleTrack
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -109,13 +110,27 @@ def test_each_drive_has_its_own_vehicle(model):
     control = type(start[0])([0.3, -0.2, 0.1])
     found = np.array(vehicle.derivative(start, control))
     for k in range(3):
-        own = {"speed": model.speed * drawn.speed[k]}
+        own = {"speed_ms": model.speed_ms * drawn.speed[k]}
         if rows > 3 or isinstance(model, Ackermann):
             own["wheelbase"] = model.wheelbase / drawn.steering[k]
         expected = np.array(replace(model, **own).derivative(start, control))[:, k]
         if isinstance(model, Dubins):
             expected[2] *= drawn.steering[k]
         np.testing.assert_allclose(found[:, k], expected, rtol=1e-12)
+
+
+def test_a_vehicle_with_a_speed_state_is_faster_at_each_speed():
+    model = KinematicSingleTrack(8.0)
+    vehicle = Varied(model, Variation(speed_sd=0.2, steering_sd=0.3, seed=3))
+    assert vehicle.control_names == model.control_names
+    state = to_state(np.repeat(model.extend(np.zeros(3)), 3, 0))
+    control = to_control(np.array([[0.1, 1.0]] * 3))
+    drawn = vehicle.variation.draws(0, 3)
+    slope = vehicle.derivative(state, control).numpy()
+    np.testing.assert_allclose(vehicle.speed(state), 8 * drawn.speed)
+    turn = 8 / 2.7 * np.tan(0.1) * drawn.speed * drawn.steering
+    np.testing.assert_allclose(slope[2], turn)
+    np.testing.assert_allclose(slope[3], 1.0)
 
 
 def test_a_varied_drive_is_the_same_in_any_batch_and_from_run_to_run():

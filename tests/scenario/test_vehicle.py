@@ -11,7 +11,7 @@ from mi_nerfattack import vehicle as models
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.scenario.section import read_section
 from mi_nerfattack.scenario.vehicle import VehicleSection
-from mi_nerfattack.vehicle.dynamics import to_state
+from mi_nerfattack.vehicle.dynamics import to_control, to_state
 from mi_nerfattack.vehicle.integrators import Transition
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -46,6 +46,16 @@ def steep(state, control):
 
 def fails(state, control):
     raise KeyError("wheel")
+
+def two(state, control):
+    _, _, theta, speed = state
+    turn, force = control
+    return speed * dr.cos(theta), speed * dr.sin(theta), turn, force - speed
+
+def half(state, control):
+    _, _, theta, speed = state
+    turn, force = control
+    return speed * dr.cos(theta), speed * dr.sin(theta), turn, dr.detach(force) - speed
 
 number = 3
 """
@@ -154,8 +164,8 @@ def test_hard_steering_with_a_lag_stays_within_a_centimetre(keys):
     def slope(_, x):
         rate = (command - x[3]) / car.time_constant / car.max_steer_rate
         rate *= car.max_steer_rate / (1 + rate**8) ** 0.125
-        heading = car.speed / car.wheelbase * np.tan(x[3])
-        along = car.speed * np.array([np.cos(x[2]), np.sin(x[2])])
+        heading = car.speed_ms / car.wheelbase * np.tan(x[3])
+        along = car.speed_ms * np.array([np.cos(x[2]), np.sin(x[2])])
         return [*along, heading, rate]
 
     for period in range(60):
@@ -168,3 +178,50 @@ def test_hard_steering_with_a_lag_stays_within_a_centimetre(keys):
     assert worst < 0.01
     stiff = vehicle(kind="ackermann_rate", steer_time_s=0.03, substeps=2)
     assert stiff.substeps == 2 and vehicle().substeps == 1
+
+
+def test_models_with_a_speed_state():
+    found = vehicle(kind="kinematic_single_track", speed_ms=7.0, max_brake_ms2=6.0)
+    steer = np.radians(34.0)
+    model = models.KinematicSingleTrack(7.0, steer, 3.0, 6.0, 0.5, 2.7)
+    assert found.build() == model and found.has_expert and found.unit == "rad"
+    (acceleration,) = found.car().more_controls
+    assert (acceleration.lowest, acceleration.highest) == (-6.0, 3.0)
+    slips = vehicle(kind="dynamic_single_track", mass_kg=1000.0, friction=0.5)
+    car, built = slips.car(), slips.build()
+    assert (built.mass, built.friction, car.mass, car.wheelbase) == (1e3, 0.5, 1e3, 2.7)
+    # steps are so fine that a car that brakes hard in a bend comes to rest
+    assert slips.dt_s / slips.substeps <= 2 / built.fastest_rate
+    assert vehicle(kind="kinematic_single_track").substeps == 1
+    with pytest.raises(InputError, match="vehicle.substeps: .*diverge.*raise substeps"):
+        vehicle(kind="dynamic_single_track", substeps=2)
+
+
+def test_custom_vehicles_with_several_controls(folder):
+    keys = {"kind": "custom", "function": "car.py:two", "trust_code": True}
+    keys |= {"state_size": 4, "rest_state": (5.0,), "controls": 2}
+    section = vehicle(folder, **keys, control_limit=(1.5, 3.0), control_unit="rad/s")
+    dynamics = section.build()
+    assert dynamics.control_size == 2 and not section.has_expert
+    limited = dynamics.saturate(to_control(np.full((1, 2), 100.0)))
+    np.testing.assert_allclose(limited.numpy()[:, 0], [1.5, 3.0])
+    both = vehicle(folder, **keys, control_limit=2.0).build()
+    assert (
+        both.saturate(to_control(np.full((1, 2), -9.0))).numpy().tolist()
+        == [[pytest.approx(-2.0, rel=1e-4)]] * 2
+    )
+    for changes, words in (
+        ({"control_limit": (1.0, 2.0, 3.0)}, "control_limit: has 3 numbers"),
+        ({"control_limit": (1.0, -2.0)}, "control_limit.1: .*greater than 0"),
+        ({"control_limit": -1.0}, "control_limit: .*greater than 0"),
+        ({"function": "car.py:half"}, "no derivative by the control"),
+    ):
+        with pytest.raises(InputError, match=words):
+            vehicle(folder, **({**keys, "control_limit": 1.0} | changes)).build()
+
+
+def test_the_number_of_controls_leaves_old_digests_alone(folder):
+    keys = {"kind": "custom", "function": "car.py:car", "control_limit": 1.5}
+    assert ("controls",) not in [way for way, _ in vehicle(folder, **keys).leaves()]
+    several = vehicle(folder, **keys, controls=2)
+    assert (("controls",), 2) in list(several.leaves())

@@ -13,6 +13,7 @@ import torch
 from support.faults.refusals import refusals
 from support.reference.derivatives import nothing_compiled
 from support.worlds.places import (
+    BlankView,
     Grey,
     PaintedSite,
     bent,
@@ -22,12 +23,15 @@ from support.worlds.places import (
     surroundings,
 )
 
+from mi_nerfattack.deploy.car import CAR, Control
 from mi_nerfattack.deploy.place import Scatter, bundled_place
+from mi_nerfattack.deploy.simulated import SimulatedEnvironment
 from mi_nerfattack.deploy.sites import PlaceSite, Weather
+from mi_nerfattack.deploy.vehicle import KinematicVehicle, Motion
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.policy.pilotnet import PilotNet
-from mi_nerfattack.render.camera.intrinsics import from_fov
+from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
 from mi_nerfattack.system.workers import InThisProcess
 from mi_nerfattack.training.collect import collect
 from mi_nerfattack.training.dataset import FrameDataset, find_shards
@@ -37,6 +41,7 @@ from mi_nerfattack.training.sources import (
     PolicyDrives,
     Scattered,
 )
+from mi_nerfattack.vehicle import KinematicSingleTrack
 from mi_nerfattack.vehicle.expert import expert_for
 from mi_nerfattack.vehicle.route.route import load_routes
 
@@ -255,3 +260,30 @@ def test_shards_of_a_place_have_their_light(tmp_path):
         frames = data.read_frames(np.arange(4) + 4 * number)
         means[about["exposure_ev"]].append(frames.mean())
     assert max(means[-2.0]) < min(means[2.0]) - 30
+
+
+@dataclasses.dataclass(frozen=True)
+class AcceleratedSite(PaintedSite):
+    """A car with steering and acceleration, whose model drives."""
+
+    @property
+    def car(self):
+        more = (Control("acceleration", "m/s^2", -8.0, 3.0),)
+        limits = {"control_unit": "rad", "max_control": 0.6, "more_controls": more}
+        return dataclasses.replace(CAR, **limits)
+
+    def open(self, conditions):
+        car, motion = self.car, Motion(KinematicSingleTrack())
+        rest = car.max_control, car.control_unit, car.more_controls
+        vehicle = KinematicVehicle(motion, self.period, *rest)
+        view, mount = BlankView(), CameraMount()
+        return SimulatedEnvironment("blank", vehicle, view, mount, self.period)
+
+
+def test_frames_of_a_car_with_two_controls_have_both(tmp_path):
+    """The expert's, in the order of the controls; the car keeps its speed."""
+    made = AcceleratedSite(objects=False)
+    source = ExpertDrives(4)
+    _, data = gather(tmp_path, made, source, frames=8, shard=8, object_share=0.0)
+    assert data.controls.shape == (8, 2) and data.controls[:, 0].any()
+    np.testing.assert_allclose(data.controls[:, 1], 0, atol=0.02)

@@ -12,6 +12,7 @@ from support.files.folders import write_shard
 from support.worlds.places import PaintedSite, bent, small, straight
 
 from mi_nerfattack.commands.train import Train
+from mi_nerfattack.deploy.car import CAR, Control
 from mi_nerfattack.deploy.roadside.rule import Roadside
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import EvaluateSettings
@@ -268,6 +269,21 @@ def test_what_cannot_be_trained_is_refused(tmp_path, change, message):
 
 
 @dataclasses.dataclass(frozen=True)
+class AcceleratedSite(PaintedSite):
+    @property
+    def car(self):
+        more = (Control("acceleration", "m/s^2", -8.0, 3.0),)
+        limits = {"control_unit": "rad", "max_control": 0.6, "more_controls": more}
+        return dataclasses.replace(CAR, **limits)
+
+
+def two_controls(folder):
+    """Frames of a car that takes an acceleration, too."""
+    frames = np.zeros((1, 66, 200, 3), np.uint8)
+    return [write_shard(folder / "other", frames, [0], [[0.1, 1.0]])]
+
+
+@dataclasses.dataclass(frozen=True)
 class MissingSite(PaintedSite):
     def open(self, conditions):
         raise InputError("environment 'gone': pip install it")
@@ -295,6 +311,8 @@ MISSING = [SITE, MissingSite("mujoco", size_px=(200, 66))]
     [
         ({"routes": [dataclasses.replace(bent(), goal=1000)]}, "'left': goal 1000"),
         ({"sites": [PaintedSite("mitsuba", size_px=(100, 50))]}, "100 x 50 px; .* 66"),
+        ({"sites": [AcceleratedSite("mitsuba", size_px=(200, 66))]}, "acceleration"),
+        ({"more": two_controls}, "other.safetensors: controls: 2 of each frame"),
         ({"start": PilotNet(2, unit="rad")}, r"start: .*\(2, 1.5, 'rad/s'\)"),
         ({"more": frames_of((100, 50), 0)}, "other.safetensors: .* 100 x 50 px"),
         ({"more": frames_of((200, 66), 2)}, "other.safetensors: goals: 2 to 2"),

@@ -125,7 +125,13 @@ def policy_control(policy: AbstractPolicy, goal: int) -> Callable[[np.ndarray], 
     def control(image: np.ndarray) -> float:
         nonlocal memory
         row, memory = policy.step(policy_image(image), goal, memory)
-        return float(np.array(row)[0])
+        values = np.array(row)
+        if values.size != 1:
+            raise InputError(
+                f"policy.output: {values.size} controls for an image; the car needs "
+                "one: give its column"
+            )
+        return float(values.item())
 
     return control
 

@@ -12,7 +12,7 @@ from mi_nerfattack.deploy.carla.conventions import (
     point_from_unreal,
 )
 from mi_nerfattack.deploy.carla.session import CarlaSession
-from mi_nerfattack.deploy.vehicle import AbstractVehicle
+from mi_nerfattack.deploy.vehicle import AbstractVehicle, Controls
 from mi_nerfattack.errors import InputError
 
 
@@ -76,12 +76,14 @@ class KinematicDriver:
     Attributes:
         max_control: largest control that has an effect.
         control_unit: "rad/s" of a heading rate, or "rad" of a steering angle.
+        more_controls: those after the first one.
     """
 
     def __init__(self, vehicle: AbstractVehicle) -> None:
         self.vehicle = vehicle
         self.max_control = vehicle.max_control
         self.control_unit = vehicle.control_unit
+        self.more_controls = vehicle.more_controls
 
     def begin(
         self,
@@ -108,7 +110,7 @@ class KinematicDriver:
         actor.set_simulate_physics(False)
         self._place()
 
-    def apply(self, control: float) -> None:
+    def apply(self, control: Controls) -> None:
         """Advance the model and set the pose that the next tick shows."""
         self.vehicle.advance(control)
         self._place()

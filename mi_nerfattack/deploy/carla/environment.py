@@ -21,7 +21,7 @@ from mi_nerfattack.deploy.carla.drivers import (
 )
 from mi_nerfattack.deploy.carla.session import CarlaServer, CarlaSession, load_client
 from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
-from mi_nerfattack.deploy.vehicle import checked_pose, require_control
+from mi_nerfattack.deploy.vehicle import Controls, checked_control, checked_pose
 from mi_nerfattack.deploy.views.paste import Paster
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import (
@@ -81,6 +81,7 @@ class CarlaEnvironment(AbstractEnvironment):
         self.rig = Rig.of_one(camera, mount)
         self.max_control = driver.max_control
         self.control_unit = driver.control_unit
+        self.more_controls = driver.more_controls
         self._vehicle, self._axles = vehicle, axles
         self._attributes = dict(attributes or {})
         self._mount = camera_to_body(mount)
@@ -112,13 +113,13 @@ class CarlaEnvironment(AbstractEnvironment):
             seen = self._observe(frame)
         return self._paster.paste(seen)
 
-    def step(self, control: float) -> CameraFrame:
+    def step(self, control: Controls) -> CameraFrame:
         """Drive one period."""
         if self._cameras is None:
             raise InputError("environment 'carla': step comes after reset")
-        require_control(float(control))
+        checked_control(control, self.control_names)
         with self.session.guarded("drive on"):
-            self.driver.apply(float(control))
+            self.driver.apply(control)
             seen = self._observe(self.session.tick())
         return self._paster.paste(seen)
 

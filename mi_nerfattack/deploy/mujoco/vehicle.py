@@ -8,11 +8,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mi_nerfattack.deploy.car import Car
+from mi_nerfattack.deploy.car import Car, acceleration_of
 from mi_nerfattack.deploy.mujoco import car as mjcf_car
 from mi_nerfattack.deploy.mujoco.car import Handling
 from mi_nerfattack.deploy.mujoco.module import mujoco
-from mi_nerfattack.deploy.vehicle import AbstractVehicle, checked_pose, require_control
+from mi_nerfattack.deploy.vehicle import (
+    AbstractVehicle,
+    Controls,
+    checked_control,
+    checked_pose,
+)
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Positive, checked
 from mi_nerfattack.vehicle.steering import steering_angle
@@ -93,6 +98,9 @@ class MujocoVehicle(AbstractVehicle):
     wheels measure it, through a motor with a lag of its own. All of it is
     deterministic: equal controls give equal bits.
 
+    Where the car takes an acceleration, too, the speed to hold changes by it, but never
+    below 0; motor and brakes act on the rear wheels, whose grip limits both.
+
     The state is (x, y, theta, speed, steering angle, heading rate), of the point on the
     ground under the middle of the rear axle: metres, radians (theta is not wrapped),
     metres per second along the car, radians, radians per second.
@@ -106,7 +114,8 @@ class MujocoVehicle(AbstractVehicle):
 
     Raises:
         InputError: a period that is no multiple of the timestep, a timestep out of
-            range, or a car that steers about a point between its rear wheels.
+            range, a car that steers about a point between its rear wheels, or one with
+            another second control than an acceleration.
     """
 
     def __init__(
@@ -126,6 +135,17 @@ class MujocoVehicle(AbstractVehicle):
         self.steering = steering or _STEERING[car.control_unit](car.max_control)
         self.max_control = self.steering.max_control
         self.control_unit = self.steering.unit
+        self.more_controls, force = (
+            car.more_controls,
+            acceleration_of(car.more_controls),
+        )
+        if len(self.more_controls) != (force is not None):
+            raise InputError(
+                f"car.more_controls: {', '.join(self.control_names[1:])}; a car with "
+                "wheels takes an acceleration after its steering, or nothing"
+            )
+        most = self.handling.max_acceleration
+        self._force: tuple[float, float] = force or (-most, most)
         self._substeps = _count_substeps(period, timestep)
         spec = mujoco.MjSpec()
         mjcf_car.add_ground(spec)
@@ -156,16 +176,21 @@ class MujocoVehicle(AbstractVehicle):
         self._speed, self._theta = float(speed), theta
         self._steer = self._excess = 0.0
 
-    def advance(self, control: float) -> None:
+    def advance(self, control: Controls) -> None:
         """Drive one period."""
         if self._speed is None:
             raise InputError("vehicle: advance comes after reset")
-        require_control(control)
-        limited = min(max(control, -self.max_control), self.max_control)
+        steer, *more = checked_control(control, self.control_names).tolist()
+        limited = min(max(steer, -self.max_control), self.max_control)
+        acceleration = (
+            min(max(more[0], self._force[0]), self._force[1]) if more else 0.0
+        )
         angle = self.steering.angle(limited, self._speed, self.car.wheelbase)
         angle = min(max(angle, -self.car.max_steer), self.car.max_steer)
         for _ in range(self._substeps):
-            self._substep(angle, self._speed)
+            before = self._speed
+            self._speed = max(0.0, before + acceleration * self._model.opt.timestep)
+            self._substep(angle, self._speed, self._speed - before)
         turn = self._heading() - self._theta
         self._theta += math.remainder(turn, 2 * math.pi)
 
@@ -210,18 +235,25 @@ class MujocoVehicle(AbstractVehicle):
         front = rear + self.car.wheelbase * rate
         return np.array([front * math.cos(steer) - along * math.sin(steer), rear])
 
-    def _substep(self, angle: float, speed: float) -> None:
-        """Command steering and motor, and integrate one timestep."""
+    def _substep(self, angle: float, speed: float, change: float) -> None:
+        """Command steering and motor, and integrate one timestep.
+
+        Args:
+            angle: of the front wheels, wanted.
+            speed: to hold.
+            change: of this speed within the timestep, m/s.
+        """
         model, data = self._model, self._data
         dt = model.opt.timestep
         reach = self.handling.steer_rate * dt
         self._steer += min(max(angle - self._steer, -reach), reach)
         missing = speed - self.car.wheel_radius * data.ten_velocity[0]
-        limit = self.handling.max_acceleration
+        low, high = self._force
         wanted = _SPEED_GAIN * missing + _SPEED_INTEGRAL_GAIN * self._excess
-        if abs(wanted) < limit:  # the integral does not wind up at the limit
+        wanted += change / dt
+        if low < wanted < high:  # the integral does not wind up at the limit
             self._excess += missing * dt
-        data.ctrl[:] = self._steer, min(max(wanted, -limit), limit)
+        data.ctrl[:] = self._steer, min(max(wanted, low), high)
         mujoco.mj_step(model, data)
 
     def _settle(self) -> np.ndarray:

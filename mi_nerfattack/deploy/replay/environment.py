@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from mi_nerfattack.deploy.car import Control
 from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
 from mi_nerfattack.deploy.replay.folder import FolderRecording
 from mi_nerfattack.deploy.replay.mcap import McapRecording, McapTopics
 from mi_nerfattack.deploy.replay.recording import AbstractRecording, vehicle_states
 from mi_nerfattack.deploy.replay.video import VideoRecording
-from mi_nerfattack.deploy.vehicle import require_control
+from mi_nerfattack.deploy.vehicle import Controls, checked_control
 from mi_nerfattack.deploy.views.paste import Paster
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
@@ -38,9 +39,11 @@ class ReplayEnvironment(AbstractEnvironment):
         period: seconds between two frames.
         max_control: largest control of the policy; it has no effect.
         control_unit: of the control.
+        more_controls: of the policy, after the first one.
 
     Attributes:
-        controls: what the policy would have done since the last reset.
+        controls: what the policy would have done since the last reset: a number a
+            period, or (k,) of k > 1 controls.
     """
 
     name = "replay"
@@ -52,14 +55,15 @@ class ReplayEnvironment(AbstractEnvironment):
         period: float = 0.1,
         max_control: float = 1.5,
         control_unit: str = "rad/s",
+        more_controls: tuple[Control, ...] = (),
     ) -> None:
         if not 0 < period < math.inf:
             raise InputError(f"period: {period}; a positive time, seconds")
         self.recording, self.camera = recording, recording.camera
         self.rig = Rig.of_one(recording.camera, mount)
         self.period, self.max_control = period, max_control
-        self.control_unit = control_unit
-        self.controls: list[float] = []
+        self.control_unit, self.more_controls = control_unit, more_controls
+        self.controls: list[float | np.ndarray] = []
         self._states = vehicle_states(recording.track, mount)
         self._paster = Paster(self.camera, ())
         self._index = -1
@@ -72,7 +76,7 @@ class ReplayEnvironment(AbstractEnvironment):
         self.controls = []
         return self._show_frame()
 
-    def step(self, control: float) -> CameraFrame:
+    def step(self, control: Controls) -> CameraFrame:
         """Note the control and show the next frame.
 
         Raises:
@@ -81,13 +85,13 @@ class ReplayEnvironment(AbstractEnvironment):
         """
         if self._index < 0:
             raise InputError("environment 'replay': step comes after reset")
-        require_control(float(control))
+        values = checked_control(control, self.control_names)
         if self.is_over:
             raise InputError(
                 f"{self.recording.track.where}: the recording is over after "
                 f"{len(self.controls)} steps; reset goes back to its start"
             )
-        self.controls.append(float(control))
+        self.controls.append(float(values[0]) if len(values) == 1 else values)
         return self._show_frame()
 
     @property

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
-from mi_nerfattack.deploy.vehicle import require_control
+from mi_nerfattack.deploy.vehicle import Controls, checked_control
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -33,6 +33,7 @@ class AbstractAround(AbstractEnvironment):
         self.rig = inside.rig
         self.period, self.max_control = inside.period, inside.max_control
         self.control_unit = inside.control_unit
+        self.more_controls = inside.more_controls
 
     def reset(
         self, route: Route, pose: np.ndarray | None = None, seed: int = 0
@@ -80,7 +81,7 @@ class LateFrames(AbstractAround):
         super().__init__(inside)
         self._frames: deque[CameraFrame] = deque(maxlen=_whole("late", periods) + 1)
 
-    def step(self, control: float) -> CameraFrame:
+    def step(self, control: Controls) -> CameraFrame:
         """Hold a control, and return the frame that arrives."""
         self._frames.append(self.inside.step(control))
         return self._frames[0]
@@ -110,7 +111,7 @@ class DroppedFrames(AbstractAround):
         self._draws = np.random.default_rng()
         self._last: CameraFrame | None = None
 
-    def step(self, control: float) -> CameraFrame:
+    def step(self, control: Controls) -> CameraFrame:
         """Hold a control, and return the last frame that came."""
         if self._last is None:
             raise InputError(f"environment {self.name!r}: step comes after reset")
@@ -137,24 +138,26 @@ class LateControls(AbstractAround):
     def __init__(self, inside: AbstractEnvironment, periods: int) -> None:
         super().__init__(inside)
         self.periods = _whole("latency", periods)
-        self._controls: deque[float] = deque()
+        self._controls: deque[Controls] = deque()
 
-    def step(self, control: float) -> CameraFrame:
+    def step(self, control: Controls) -> CameraFrame:
         """Take a control, and hold the one whose turn it is."""
         return self.inside.step(self._exchange(control))
 
-    def advance(self, control: float) -> None:
+    def advance(self, control: Controls) -> None:
         """Likewise, and look at nothing."""
         self.inside.advance(self._exchange(control))
 
-    def _exchange(self, control: float) -> float:
-        require_control(control)  # now, not when its turn comes
+    def _exchange(self, control: Controls) -> Controls:
+        checked_control(control, self.control_names)  # now, not when its turn comes
         self._controls.append(control)
         return self._controls.popleft()
 
     def _begin(self, frame: CameraFrame, seed: int) -> CameraFrame:
         del seed
-        self._controls = deque([0.0] * self.periods)
+        count = len(self.control_names)
+        none = 0.0 if count == 1 else np.zeros(count)
+        self._controls = deque([none] * self.periods)
         return frame
 
 

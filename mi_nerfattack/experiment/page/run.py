@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from mi_nerfattack.drives.store import read_drives
-from mi_nerfattack.drives.table import STATE_ROWS, STEPS, read_csv, records
+from mi_nerfattack.drives.table import FURTHER, STEPS, read_csv, records
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.attribution import ATTRIBUTION, UNCHANGED
 from mi_nerfattack.experiment.run_folder import (
@@ -278,7 +278,7 @@ def _pane(
 def _read_errors(path: Path) -> dict[tuple[str, str], dict[int, tuple[float, float]]]:
     """Read where first drives were, by environment and case; nothing without a file."""
     found: dict[tuple[str, str], dict[int, tuple[float, float]]] = {}
-    table = read_csv(path, STEPS, STATE_ROWS) if path.is_file() else pd.DataFrame()
+    table = read_csv(path, STEPS, FURTHER) if path.is_file() else pd.DataFrame()
     for row in records(table):
         if row["run"] == 0:
             own = found.setdefault((row["environment"], row["case"]), {})

@@ -35,7 +35,7 @@ from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import Trajectory
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import Appearance, World
-from mi_nerfattack.vehicle.dynamics import to_state
+from mi_nerfattack.vehicle.dynamics import to_control, to_state
 
 _OURS = re.compile(r"[0-9]{4,}(_input)?\.(exr|png)|transforms\.json|depth\.safetensors")
 
@@ -252,7 +252,7 @@ class Film:
         frame = self.environment.reset(route, drive.poses[0], drive.seed)
         for step in range(len(drive.controls) + 1):
             if step:
-                control = float(drive.controls[step - 1])
+                control = drive.controls[step - 1]
                 if watched or step in wanted:
                     frame = self.environment.step(control)
                 else:
@@ -279,7 +279,7 @@ class Film:
         if not is_surrogate or not world.policy.differentiable:
             return {}
         found = list(self.moments(()))
-        rows = [to_state(np.full((1, 3), u))[0] for u in self.drive.controls]
+        rows = [to_control(np.reshape(u, (1, -1))) for u in self.drive.controls]
         states = [to_state(moment.state[None]) for moment in found]
         loop, kept = world.loop(environment.sensor), [m.memory for m in found]
         drive = Trajectory(tuple(states), tuple(rows), loop.dt, tuple(kept))
@@ -335,7 +335,7 @@ class Film:
             state=state.tolist(),
             control=None
             if step == len(drive.controls)
-            else float(drive.controls[step]),
+            else drive.controls[step].tolist(),
             cross_track_m=float(world.route.cross_track_numpy(state[None])[0]),
         )
 

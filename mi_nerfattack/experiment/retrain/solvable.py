@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mi_nerfattack.deploy.car import acceleration_of
 from mi_nerfattack.deploy.registry import kinematic_vehicle
 from mi_nerfattack.deploy.roadside.footprint import Shape
 from mi_nerfattack.errors import InputError
@@ -63,7 +64,12 @@ def drive_expert(found: FoundAttack) -> Driven:
         )
     vehicle = kinematic_vehicle(place)
     expert = expert_for(
-        car.control_unit, route, place.period, car.max_control, car.wheelbase
+        car.control_unit,
+        route,
+        place.period,
+        car.max_control,
+        car.wheelbase,
+        acceleration=acceleration_of(car.more_controls),
     )
     objects = [item for item in attacked_objects(found) if _is_in_the_way(item)]
     outlines = np.concatenate([np.zeros((0, 2)), *map(_outline, objects)])
@@ -72,7 +78,7 @@ def drive_expert(found: FoundAttack) -> Driven:
         vehicle.reset(pose, route.speed_ms)
         states = [vehicle.state[:3]]
         for _ in range(found.horizon):
-            vehicle.advance(float(expert.control(vehicle.state)[0]))
+            vehicle.advance(expert.control(vehicle.state)[0])
             states.append(vehicle.state[:3])
         path = np.stack(states)
         errors.append(np.abs(route.cross_track_numpy(path[1:])).max())

@@ -71,9 +71,9 @@ class FrameSource:
             route = self.viewed.world.route
             frame = environment.reset(route, drive.poses[0], drive.seed)
             for control in drive.controls[: max(step - 1, 0)]:
-                environment.advance(float(control))
+                environment.advance(control)
             if step:
-                frame = environment.step(float(drive.controls[step - 1]))
+                frame = environment.step(drive.controls[step - 1])
             return frame.image
 
     def difference(

@@ -232,6 +232,8 @@ def describe(viewed: ViewedRun, drive: Drive, step: int) -> str:
     side = "left" if error > 0 else "right"
     told = f"{step * dt_s:.1f} s: {abs(error):.2f} m {side} of the lane's centre"
     if step < len(drive.controls):
-        unit = viewed.world.scenario.vehicle.car().control_unit
-        told += f", control {drive.controls[step]:+.3f} {unit}"
+        car = viewed.world.scenario.vehicle.car()
+        units = car.control_unit, *(control.unit for control in car.more_controls)
+        pairs = zip(np.ravel(drive.controls[step]), units, strict=True)
+        told += f", control {', '.join(f'{u:+.3f} {unit}' for u, unit in pairs)}"
     return told

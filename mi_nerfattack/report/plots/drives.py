@@ -138,6 +138,7 @@ def control_change(
 ) -> None:
     """Plot by how much controls differ from those of a drive, step by step.
 
+    Of several controls, the first one is plotted, which steers.
     Random looks appear as the range over their runs and its mean.
 
     Args:
@@ -146,10 +147,11 @@ def control_change(
         base: the drive of the case `own`.
         unit: of the control.
     """
+    own = base.first_controls
     with chart(path, 3.0) as figure:
         axis = figure.subplots()
         changes = {
-            case: [d.controls - base.controls for d in drives if d.case == case]
+            case: [d.first_controls - own for d in drives if d.case == case]
             for case in CASES
         }
         if changes[RANDOM]:

@@ -6,10 +6,18 @@ import math
 from dataclasses import dataclass
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.ranges import ControlUnit, NonNegative, Positive, Seconds, checked
+from mi_nerfattack.ranges import (
+    ControlUnit,
+    Negative,
+    NonNegative,
+    Positive,
+    Seconds,
+    checked,
+)
 from mi_nerfattack.vehicle.expert.lane_follower import (
     AbstractExpert,
     LaneFollower,
+    SpeedKeeper,
     SteeringFollower,
 )
 from mi_nerfattack.vehicle.route.route import Route
@@ -18,6 +26,7 @@ from mi_nerfattack.vehicle.steering import heading_rate
 __all__ = [
     "AbstractExpert",
     "LaneFollower",
+    "SpeedKeeper",
     "SteeringFollower",
     "expert_for",
 ]
@@ -40,6 +49,7 @@ class _Vehicle:
     max_control: Positive
     wheelbase: Positive
     lag: NonNegative
+    acceleration: tuple[Negative, Positive] | None
 
 
 def expert_for(
@@ -49,11 +59,13 @@ def expert_for(
     max_control: float = 1.5,
     wheelbase: float = 2.7,
     lag: float = 0.1,
+    acceleration: tuple[float, float] | None = None,
 ) -> AbstractExpert:
     """Make the expert of a route for a vehicle.
 
-    `LaneFollower` gives a heading rate, `SteeringFollower` a steering angle. Distances
-    grow with the route's speed. Neither remembers anything.
+    `LaneFollower` gives a heading rate, `SteeringFollower` a steering angle, and
+    `SpeedKeeper` an acceleration besides. Distances grow with the route's speed. None
+    remembers anything.
 
     The lag only moves the point where the curvature is read. One policy for cars with
     and without lag cannot know which it drives: label its frames with the lag in
@@ -67,11 +79,13 @@ def expert_for(
         wheelbase: of the car, metres; has no effect on heading rates.
         lag: seconds from a control to the vehicle's answer: 0 of kinematic models,
             otherwise its steering's time constants and delay.
+        acceleration: lowest and highest acceleration, m/s^2, of a vehicle whose second
+            control it is; None of one with a single control.
 
     Raises:
         InputError: unknown unit, or a number out of range.
     """
-    _Vehicle(control_unit, period, max_control, wheelbase, lag)
+    _Vehicle(control_unit, period, max_control, wheelbase, lag, acceleration)
     if control_unit == "rad" and max_control >= math.pi / 2:
         raise InputError(f"expert.max_control: {max_control!r} rad; below pi/2")
     speed = float(route.speed_ms)
@@ -83,5 +97,13 @@ def expert_for(
 
     if control_unit == "rad":
         fastest = heading_rate(max_control, speed, wheelbase)
-        return SteeringFollower(follower(fastest), wheelbase, max_control)
+        steering = SteeringFollower(follower(fastest), wheelbase, max_control)
+        if acceleration is None:
+            return steering
+        return SpeedKeeper(steering, speed, *acceleration)
+    if acceleration is not None:
+        raise InputError(
+            "expert.acceleration: is given with a heading rate; an expert accelerates "
+            "vehicles that are steered by an angle, in rad"
+        )
     return follower(max_control)

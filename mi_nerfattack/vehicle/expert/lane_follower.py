@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from mi_nerfattack.ranges import Acute, Positive, checked
+from mi_nerfattack.ranges import Acute, Negative, Positive, checked
 from mi_nerfattack.vehicle.route.route import Route
 from mi_nerfattack.vehicle.steering import heading_rate, steering_angle
 
@@ -32,7 +32,8 @@ class AbstractExpert(ABC):
                 that are not read.
 
         Returns:
-            (n,), positive to the left, clipped to the expert's limit.
+            (n,), positive to the left, clipped to the expert's limit; (n, 2) of a
+            `SpeedKeeper`.
         """
 
 
@@ -117,6 +118,43 @@ class SteeringFollower(AbstractExpert):
         return np.clip(angle, -self.max_control, self.max_control)
 
 
+@dataclass(frozen=True, eq=False)
+@checked("SpeedKeeper")
+class SpeedKeeper(AbstractExpert):
+    """A follower of the lane for a vehicle whose second control is an acceleration.
+
+    The acceleration is `gain (v - speed)`, clipped. The follower steers as at the speed
+    v, whatever the speed is: the angle decides about the curvature alone.
+
+    Args:
+        follower: steers.
+        speed: v, wanted, m/s.
+        lowest: acceleration, m/s^2, of the brakes.
+        highest: largest acceleration, m/s^2.
+        gain: 1/s.
+    """
+
+    follower: SteeringFollower
+    speed: Positive
+    lowest: Negative = -8.0
+    highest: Positive = 3.0
+    gain: Positive = 1.0
+
+    control_unit: ClassVar[str] = "rad"
+
+    def control(self, states: Any) -> np.ndarray:
+        """Compute both controls (n, 2) of states (n, m) or (m,).
+
+        Row 3 of a state is its speed, m/s; a state without it has the wanted one.
+        """
+        states = np.atleast_2d(np.asarray(states, np.float64))
+        has_speed = states.shape[1] > 3
+        missing = self.speed - (states[:, 3] if has_speed else self.speed)
+        acceleration = np.clip(self.gain * missing, self.lowest, self.highest)
+        steering = self.follower.control(states)
+        return np.stack([steering, np.broadcast_to(acceleration, len(states))], axis=1)
+
+
 def future_positions(
     expert: AbstractExpert,
     poses: np.ndarray,
@@ -147,7 +185,7 @@ def future_positions(
     start = np.asarray(poses, np.float64)[:, :3]
     state, world = start, np.empty((len(start), len(ahead), 2))
     for step in range(int(whole.max()) + 1):
-        rate = expert.control(state)
+        rate = expert.control(state).reshape(len(state), -1)[:, 0]
         if expert.control_unit == "rad":
             rate = heading_rate(rate, speed, wheelbase)
         for index in np.flatnonzero(whole == step):

@@ -7,8 +7,10 @@ import socket
 import threading
 from contextlib import closing, contextmanager
 
+import mitsuba as mi
 import numpy as np
 import pytest
+import torch
 from support.faults.injected import free_port
 from support.faults.refusals import refusals
 from torch import nn
@@ -18,6 +20,7 @@ from mi_nerfattack.io.network import Endpoint, read_token
 from mi_nerfattack.policy.action import Action
 from mi_nerfattack.policy.http import server as http_server
 from mi_nerfattack.policy.http.client import PolicyClient
+from mi_nerfattack.policy.http.policy import HttpPolicy
 from mi_nerfattack.policy.http.server import PolicyServer
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 
@@ -82,6 +85,23 @@ def test_memories_are_of_a_client_and_repetitions_change_nothing():
         assert asked(one, 0.5, 0) == 0.5
         image = np.full((1, 3, 4, 5), 51, np.uint8)
         assert one.ask(image, [0], 0) == pytest.approx([0.2])  # bytes are of 255
+
+
+class Both(nn.Module):
+    def forward(self, image):
+        level = image.mean((1, 2, 3))
+        return torch.stack([level, -2 * level, 0 * level], 1)
+
+
+def test_several_controls_of_each_image_are_a_list():
+    """Served by one policy, and asked for by another that swaps them."""
+    images = np.concatenate([grey(0.25), grey(0.5)])
+    with serving(TorchPolicy(Both(), output=(0, 1))) as (_, url):
+        answer = PolicyClient(url, TOKEN).ask(images, [0, 0], 0)
+        np.testing.assert_allclose(answer, [[0.25, -0.5], [0.5, -1.0]])
+        policy = HttpPolicy(url, output=(1, 0), control_scale=(1.0, 2.0), token=TOKEN)
+        rows = policy.control(mi.TensorXf(images.transpose(0, 2, 3, 1)), 0)
+        np.testing.assert_allclose(rows, [[-0.5, -1.0], [0.5, 1.0]])
 
 
 def test_memories_and_connections_are_limited(monkeypatch):
