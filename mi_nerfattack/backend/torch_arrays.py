@@ -31,17 +31,12 @@ def to_row(value: torch.Tensor, like: Any) -> Any:
 
 
 def to_controls(value: torch.Tensor, like: Any) -> Any:
-    """Make controls (n,), or (k, n) of columns (n, k), as :func:`to_row` does."""
+    """Make a row (n,) of controls (n,), k rows (k, n) of controls (n, k)."""
     if value.ndim == 1:
         return to_row(value, like)
-    kind = sys.modules[dr.array_t(like).__module__]
+    kind: Any = sys.modules[type(like).__module__]
     rows = kind.ArrayXf64 if dr.type_v(like) == dr.VarType.Float64 else kind.ArrayXf
-    return rows(*[to_row(column, like) for column in value.T])
-
-
-def from_controls(controls: Any) -> torch.Tensor:
-    """Return controls (n,) as they are, and (k, n) as columns (n, k), detached."""
-    return to_torch(controls).T if dr.depth_v(controls) == 2 else to_torch(controls)
+    return rows(*(to_row(column, like) for column in value.unbind(1)))
 
 
 def _settled(value: torch.Tensor, like: Any) -> Any:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from mi_nerfattack.evaluation.evaluate import EvaluateSettings
     from mi_nerfattack.evaluation.identity import EnvironmentUnder
     from mi_nerfattack.evaluation.work import EvaluateDrives, Evaluation
-    from mi_nerfattack.scenario.policy import AbstractPolicySection
+    from mi_nerfattack.scenario.policy.kinds import AbstractPolicySection
     from mi_nerfattack.system.workers import AbstractWorkers
     from mi_nerfattack.training.record import TrainingRecord
     from mi_nerfattack.vehicle.route.route import Route
@@ -160,7 +160,7 @@ class Evaluate:
         taken = place.car.control_unit if vehicle is None else vehicle.unit
         if reason := misfit(section.unit(), taken, section.source):
             raise InputError(f"policy: the car of the place {reason}")
-        check_policy(section.build(), place, routes)
+        check_policy(section.build(place.rig.views), place, routes)
         store = Store(self.drives)
         return EvaluateDrives(store, section, place, under, routes, settings, vehicle)
 
@@ -233,7 +233,7 @@ class Evaluate:
         return parse_conditions(self.environments, self.conditions, self.spp)
 
     def _workers(self, policy: AbstractPolicySection) -> AbstractWorkers:
-        from mi_nerfattack.scenario.policy import HttpSection
+        from mi_nerfattack.scenario.policy.kinds import HttpSection
         from mi_nerfattack.system.workers import chosen_workers
 
         # a server that keeps a state would mix the drives of several processes
@@ -303,7 +303,7 @@ def _check_different(option: str, names: tuple[str, ...]) -> None:
 
 def _training_record(work: EvaluateDrives) -> TrainingRecord | None:
     """Read what training wrote beside the policy; None where it wrote nothing."""
-    from mi_nerfattack.scenario.policy import PilotNetSection, ProgramSection
+    from mi_nerfattack.scenario.policy.kinds import PilotNetSection, ProgramSection
     from mi_nerfattack.training.record import read_record
 
     if not isinstance(work.policy, PilotNetSection | ProgramSection):

@@ -51,12 +51,16 @@ class ServePolicy:
         if self.size is not None and min(self.size) < 1:
             raise InputError(f"--size: {self.size}; width and height, 1 or more")
         variant.ensure()
-        policy = PolicyFile.read(self.policy, self.settings).section.build()
+        file = PolicyFile.read(self.policy, self.settings)
+        policy = file.section.build(file.views)
         if self.size is not None:
             import mitsuba as mi
 
             black = mi.TensorXf(np.zeros((1, *self.size[::-1], 3), np.float32))
-            policy.step(black, 0, policy.initial_memory(1))
+            numbers = None
+            if size := policy.numbers.size:
+                numbers = mi.TensorXf(np.zeros((1, size), np.float32))
+            policy.step(black, 0, policy.initial_memory(1), numbers)
         with closing(PolicyServer(endpoint, policy, token)) as server:
             asked = "asks for the token" if token else "on this computer alone"
             say(f"Serving at http://{endpoint}, {asked}; Ctrl-C ends")

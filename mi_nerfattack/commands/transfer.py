@@ -88,7 +88,7 @@ class Transfer:
         from mi_nerfattack.io import files
         from mi_nerfattack.report.plots.transfer import quality_condition
         from mi_nerfattack.report.table import quality_table, transfer_table
-        from mi_nerfattack.scenario.policy import HttpSection
+        from mi_nerfattack.scenario.policy.kinds import HttpSection
         from mi_nerfattack.system.workers import chosen_workers
 
         files.check_folder(self.output)

@@ -69,6 +69,11 @@ class AbstractVehicle(ABC):
 
     @property
     @abstractmethod
+    def speed(self) -> float:
+        """Speed along the heading, metres per second."""
+
+    @property
+    @abstractmethod
     def body_to_world(self) -> np.ndarray:
         """Pose (4, 4): x forward, y left, z up, origin on the ground at x, y."""
 
@@ -163,9 +168,9 @@ class KinematicVehicle(AbstractVehicle):
         """Put the vehicle somewhere; `seed` has no effect on it."""
         del seed
         motion = self.motion
-        key = speed if "speed_ms" in motion.dynamics.__dataclass_fields__ else None
+        key = speed if "speed" in motion.dynamics.__dataclass_fields__ else None
         if key not in self._transitions:
-            changed = {} if key is None else {"speed_ms": key}
+            changed = {} if key is None else {"speed": key}
             self._transitions[key] = Transition(
                 replace(motion.dynamics, **changed),
                 motion.integrator,
@@ -194,6 +199,13 @@ class KinematicVehicle(AbstractVehicle):
         if self._state is None:
             raise InputError("vehicle: it has a state only after reset")
         return np.array(self._state)[:, 0].astype(np.float64)
+
+    @property
+    def speed(self) -> float:
+        """Speed of the model."""
+        if self._transition is None:
+            raise InputError("vehicle: it has a speed only after reset")
+        return float(self._transition.dynamics.speed_of(self._state)[0])
 
     @property
     def body_to_world(self) -> np.ndarray:

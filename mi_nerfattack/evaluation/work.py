@@ -34,10 +34,11 @@ from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.io import files
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.render.camera.intrinsics import from_fov
+from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.rollout.drive import EXPERT, NO_OBJECT, Drive, departure_limits
 from mi_nerfattack.rollout.loop import OnStep
 from mi_nerfattack.scenario.named_file import section_content
-from mi_nerfattack.scenario.policy import AbstractPolicySection
+from mi_nerfattack.scenario.policy.kinds import AbstractPolicySection
 from mi_nerfattack.scenario.vehicle import AbstractVehicleSection
 from mi_nerfattack.system.workers import AbstractWorkers, InThisProcess
 from mi_nerfattack.vehicle.expert import expert_for
@@ -185,7 +186,8 @@ class EvaluateDriver(AbstractDriver):
     def __init__(self, work: EvaluateDrives) -> None:
         super().__init__()
         self._work = work
-        self._policy, self._place = work.policy.build(), work.build_place()
+        self._place = work.build_place()
+        self._policy = work.policy.build(self._place.rig.views)
         self._objects, self._surroundings = load_objects(work)
 
     def drive(self, spec: DriveSpec, on_step: OnStep) -> Drive:
@@ -212,7 +214,7 @@ class EvaluateDriver(AbstractDriver):
     def _make(self, under: EnvironmentUnder, blind: bool) -> AbstractEnvironment:
         place, conditions = self._place, under.conditions
         if blind:
-            place = replace(place, camera=_EXPERT_CAMERA)
+            place = place.with_rig(Rig.of_one(_EXPERT_CAMERA, place.mount))
             conditions = replace(conditions, spp=1)
         return make_environment(under.name, place, conditions)
 
@@ -307,10 +309,13 @@ def check_policy(policy: AbstractPolicy, place: Place, routes: Sequence[Route]) 
     Raises:
         InputError: the camera's image or a goal does not fit.
     """
-    shape = (1, place.camera.height, place.camera.width, 3)
-    image = mi.TensorXf(np.zeros(shape, np.float32))
+    width, height = place.rig.size
+    shape = (1, height, width, 3)
+    image, numbers = mi.TensorXf(np.zeros(shape, np.float32)), None
+    if size := policy.numbers.size:
+        numbers = mi.TensorXf(np.zeros((1, size), np.float32))
     for route in routes:
-        policy.step(image, route.goal, policy.initial_memory(1))
+        policy.step(image, route.goal, policy.initial_memory(1), numbers)
 
 
 def _relative(name: str) -> str:

@@ -37,7 +37,7 @@ from mi_nerfattack.rollout.drive import (
 )
 from mi_nerfattack.scenario.deployment import SURROGATE, CarlaDeployment, labelled
 from mi_nerfattack.scenario.named_file import portable_text
-from mi_nerfattack.scenario.policy import HttpSection
+from mi_nerfattack.scenario.policy.kinds import HttpSection
 from mi_nerfattack.scenario.scenario import Scenario, is_within, load_scenario
 from mi_nerfattack.scenario.world import World, build_attack, build_world
 from mi_nerfattack.scenes import resolve

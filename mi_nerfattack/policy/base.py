@@ -3,48 +3,105 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+
+from mi_nerfattack.ranges import Positive, checked
 
 #: What a policy carries from one control period to the next: arrays of its own kind.
 Memory = tuple[Any, ...]
 
 
+@dataclass(frozen=True)
+@checked("numbers")
+class Numbers:
+    """What a policy is told besides images and goal: columns of one tensor (n, k).
+
+    Args:
+        speed: one column, metres per second along the heading.
+        route_m: arc lengths, metres, from the route's point nearest to the vehicle to
+            points ahead; of each the coordinates forward and to the left of the
+            vehicle, metres: x1, y1, x2, y2, ...
+        time: one column, seconds since the start of the drive.
+    """
+
+    speed: bool = False
+    route_m: tuple[Positive, ...] = ()
+    time: bool = False
+
+    def __bool__(self) -> bool:
+        return self.size > 0
+
+    @property
+    def size(self) -> int:
+        """Number k of columns."""
+        return self.speed + 2 * len(self.route_m) + self.time
+
+    @property
+    def columns(self) -> dict[str, slice]:
+        """Columns by name, in their order: speed, route, time."""
+        sizes = {
+            "speed": int(self.speed),
+            "route": 2 * len(self.route_m),
+            "time": int(self.time),
+        }
+        found, start = {}, 0
+        for name, size in sizes.items():
+            if size:
+                found[name] = slice(start, start + size)
+            start += size
+        return found
+
+
 class AbstractPolicy(ABC):
     """Map from images to controls with a vector-Jacobian product.
 
-    Images and controls are Dr.Jit arrays, so that the closed loop needs to know no
-    other library. A call starts by waiting for the images. The closed loop calls
-    `step` and its derivatives; those here are of policies without memory.
+    Images, numbers and controls are Dr.Jit arrays, so that the closed loop needs to
+    know no other library. A call starts by waiting for the images. The closed loop
+    calls `step` and its derivatives; those here are of policies without memory and
+    without numbers.
 
     Attributes:
         differentiable: whether derivatives exist; gradient methods refuse others.
+        numbers: what the policy is told besides images and goal.
     """
 
     differentiable: ClassVar[bool] = True
+    numbers: Numbers = Numbers()
 
     def initial_memory(self, count: int) -> Memory:
         """Return the memory of `count` vehicles before their first image."""
         del count
         return ()
 
-    def step(self, image: Any, goal: Any, memory: Memory) -> tuple[Any, Memory]:
+    def step(
+        self, image: Any, goal: Any, memory: Memory, numbers: Any = None
+    ) -> tuple[Any, Memory]:
         """Evaluate the policy and its next memory.
 
         Args:
             image: as for `control`.
             goal: as for `control`.
             memory: from `initial_memory` or the step before; left unchanged.
+            numbers: tensor (n, k) of the columns of :attr:`numbers`; None without.
 
         Returns:
             The control, as `control` gives it, and the memory for the next step.
         """
+        del numbers
         return self.control(image, goal), memory
 
     def step_vjp(
-        self, image: Any, goal: Any, memory: Memory, cotangent: Any, d_memory: Memory
-    ) -> tuple[Any, Memory]:
+        self,
+        image: Any,
+        goal: Any,
+        memory: Memory,
+        cotangent: Any,
+        d_memory: Memory,
+        numbers: Any = None,
+    ) -> tuple[Any, Memory, Any]:
         """Multiply cotangents by the derivative of `step`.
 
         Args:
@@ -52,15 +109,17 @@ class AbstractPolicy(ABC):
                 steps one after the other: each row of a batch stands for itself.
             goal: as given to `step`.
             memory: likewise.
-            cotangent: (n,) or (k, n), derivative of the objective by the control.
+            cotangent: derivative of the objective by the control, of its shape.
             d_memory: derivative of the objective by the memory that `step`
                 returned, of its structure; ``()`` after the last step.
+            numbers: as given to `step`.
 
         Returns:
-            Derivatives of the objective by the image and by `memory`.
+            Derivatives of the objective by the image, by `memory` and by `numbers`,
+            which is None where those are.
         """
-        del memory, d_memory
-        return self.vjp(image, goal, cotangent)[1], ()
+        del memory, d_memory, numbers
+        return self.vjp(image, goal, cotangent)[1], (), None
 
     def planes(self, image: Any, memory: Memory) -> np.ndarray:
         """Return what `step` makes of images before it looks at them.
@@ -86,9 +145,8 @@ class AbstractPolicy(ABC):
             goal: an integer, or one for each image.
 
         Returns:
-            The control of each image, a row (n,), in the unit of the vehicle's; of a
-            vehicle with k > 1 controls an array of k rows (k, n), such as `ArrayXf`.
-            Evaluated and detached.
+            Evaluated and detached, in the units of the vehicle's controls: a row (n,)
+            of one control, k rows (k, n) of several.
         """
 
     @abstractmethod
@@ -98,9 +156,9 @@ class AbstractPolicy(ABC):
         Args:
             image: as for `control`.
             goal: as for `control`.
-            cotangent: (n,) or (k, n), derivative of the objective by the control.
+            cotangent: row (n,), derivative of the objective by the control.
 
         Returns:
-            The control, and the derivative of the objective by the image, a
+            The control (n,), and the derivative of the objective by the image, a
             tensor of the image's shape; both evaluated and detached.
         """

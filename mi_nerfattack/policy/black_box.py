@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NoReturn
 
 import numpy as np
@@ -11,15 +11,10 @@ import torch
 
 from mi_nerfattack.backend.torch_arrays import to_controls, to_torch
 from mi_nerfattack.errors import InputError, is_interrupt
-from mi_nerfattack.policy.base import AbstractPolicy, Memory
-from mi_nerfattack.policy.checks import (
-    Output,
-    Scale,
-    check_images,
-    chosen_controls,
-    expand_goals,
-    scaled,
-)
+from mi_nerfattack.policy.action import Action
+from mi_nerfattack.policy.base import AbstractPolicy, Memory, Numbers
+from mi_nerfattack.policy.checks import check_images, expand_goals
+from mi_nerfattack.policy.inputs import GOAL, Inputs
 from mi_nerfattack.policy.preprocess import Preprocess
 
 DIFFERENTIABLE_KINDS = "pilotnet, module, exported, torchscript, onnx, drjit"
@@ -28,15 +23,14 @@ DIFFERENTIABLE_KINDS = "pilotnet, module, exported, torchscript, onnx, drjit"
 class AbstractBlackBox(AbstractPolicy):
     """Policy that only answers: no gradient method takes it.
 
-    Its memory is the number of images before this one, and the frame stack. A policy
-    that keeps more than that itself starts anew where that number is 0.
+    Its memory is the number of images before this one, and the frame stack of each
+    camera. A policy that keeps more than that itself starts anew where that number
+    is 0.
 
     Args:
         preprocess: from the camera's image to the policy's.
-        control_scale: factor from the policy's unit and sign to the vehicle's; one,
-            or one for each control.
-        output: column of the control, needed where there are several; of a vehicle
-            with several controls the columns of these.
+        action: what the answer means; by default it is the control.
+        inputs: what the policy is given.
         name: for messages.
     """
 
@@ -46,52 +40,67 @@ class AbstractBlackBox(AbstractPolicy):
         self,
         name: str,
         preprocess: Preprocess | None = None,
-        control_scale: Scale = 1.0,
-        output: Output = None,
+        action: Action | None = None,
+        inputs: Inputs | None = None,
     ) -> None:
         self.name = name
         self.preprocess: Preprocess = preprocess or Preprocess()
-        self.control_scale: Scale = control_scale
-        self.output: Output = output
+        self.action: Action = action or Action()
+        self.inputs: Inputs = inputs or Inputs()
+        self.numbers: Numbers = self.inputs.numbers
 
     @abstractmethod
-    def answer(self, image: np.ndarray, goals: np.ndarray, step: int) -> np.ndarray:
+    def answer(
+        self, given: Mapping[str, np.ndarray], goals: np.ndarray, step: int
+    ) -> np.ndarray:
         """Ask the policy.
 
         Args:
-            image: what the pre-processing gives, float32, (n, c, h, w) by default.
+            given: by name; images as the pre-processing gives them, float32,
+                (n, c, h, w) by default, and what else the policy is told.
             goals: (n,) int64.
-            step: number of images before this one in the drive.
+            step: number of images before these in the drive.
 
         Returns:
-            (n,), (n, 1), or (n, k) numbers.
+            (n,), (n, 1), or (n, k) numbers, or positions.
         """
 
     def initial_memory(self, count: int) -> Memory:
-        """Return step 0 and an empty frame stack."""
-        return 0, torch.zeros(count, 0, 0, 0, 0)
+        """Return step 0 and empty frame stacks."""
+        return 0, *(torch.zeros(count, 0, 0, 0, 0) for _ in self.inputs.images)
 
-    def step(self, image: Any, goal: Any, memory: Memory) -> tuple[Any, Memory]:
+    def step(
+        self, image: Any, goal: Any, memory: Memory, numbers: Any = None
+    ) -> tuple[Any, Memory]:
         """Pre-process the images on the CPU and ask."""
-        images = to_torch(image)
+        images = to_torch(image).to("cpu", torch.float32)
         check_images(images)
-        step, past = memory
+        told = None if numbers is None else to_torch(numbers).to("cpu", torch.float32)
+        given, stacks = {}, []
         with torch.no_grad():
-            planes = self.preprocess.transform(images.to("cpu", torch.float32))
-            seen, past = self.preprocess.stack(planes, past)
-            goals = expand_goals(goal, planes).numpy().copy()
-            # a copy: functions may write into their image
-            given = np.array(seen.numpy(), order="C")
-            answer = self.answer(given, goals, step)
+            pictures = self.inputs.pictures(images).items()
+            for (name, picture), past in zip(pictures, memory[1:], strict=True):
+                planes = self.preprocess.transform(picture)
+                seen, past = self.preprocess.stack(planes, past)
+                # a copy: functions may write into their image
+                given[name] = np.array(seen.numpy(), order="C")
+                stacks.append(past)
+            numbers_by_name = self.inputs.told(told)
+            given |= {key: np.array(v.numpy()) for key, v in numbers_by_name.items()}
+            goals = expand_goals(goal, images).numpy().copy()
+            answer = self.answer(given, goals, memory[0])
             values = torch.from_numpy(np.array(answer, np.float64))
-            control = chosen_controls(values, len(images), self.output, self.name)
-        scaled_control = scaled(control, self.control_scale)
-        return to_controls(scaled_control, image), (step + 1, past)
+            speed = None
+            if self.action.needs_speed:
+                speed = numbers_by_name["speed"][:, 0].double()
+            control = self.action.controls(values, len(images), speed, self.name)
+        return to_controls(control, image), (memory[0] + 1, *stacks)
 
     def planes(self, image: Any, memory: Memory) -> np.ndarray:
-        """Return the stack of pre-processed frames, whatever their layout."""
+        """Return the stack of pre-processed frames of the first image."""
         images = to_torch(image).to("cpu", torch.float32)
-        return self.preprocess.planes(images, memory[1])
+        first, *_ = self.inputs.pictures(images).values()
+        return self.preprocess.planes(first, memory[1])
 
     def control(self, image: Any, goal: Any) -> Any:
         """Ask about first images."""
@@ -102,7 +111,13 @@ class AbstractBlackBox(AbstractPolicy):
         self._refuse()
 
     def step_vjp(
-        self, image: Any, goal: Any, memory: Memory, cotangent: Any, d_memory: Memory
+        self,
+        image: Any,
+        goal: Any,
+        memory: Memory,
+        cotangent: Any,
+        d_memory: Memory,
+        numbers: Any = None,
     ) -> NoReturn:
         """Raise InputError."""
         self._refuse()
@@ -119,29 +134,37 @@ class CallablePolicy(AbstractBlackBox):
 
     Args:
         function: gets image, goals and step as `AbstractBlackBox.answer` describes
-            them and returns an array, or a list of numbers.
+            them and returns an array, or a list of numbers. Where `inputs` names what
+            the policy is given, it is called with these arrays in that order, then
+            with the step.
         name: for messages; the others as for `AbstractBlackBox`.
     """
 
     def __init__(
         self,
-        function: Callable[[np.ndarray, np.ndarray, int], Any],
+        function: Callable[..., Any],
         name: str,
         preprocess: Preprocess | None = None,
-        control_scale: Scale = 1.0,
-        output: Output = None,
+        action: Action | None = None,
+        inputs: Inputs | None = None,
     ) -> None:
         self.function = function
-        AbstractBlackBox.__init__(self, name, preprocess, control_scale, output)
+        AbstractBlackBox.__init__(self, name, preprocess, action, inputs)
 
-    def answer(self, image: np.ndarray, goals: np.ndarray, step: int) -> np.ndarray:
+    def answer(
+        self, given: Mapping[str, np.ndarray], goals: np.ndarray, step: int
+    ) -> np.ndarray:
         """Call the function."""
+        every = {**given, GOAL: goals}
+        names = self.inputs.names or (*self.inputs.images, GOAL)
+        arguments = [every[name] for name in names]
         try:
-            return np.asarray(self.function(image, goals, step), np.float64)
+            return np.asarray(self.function(*arguments, step), np.float64)
         except Exception as err:  # a user's function raises whatever it likes
             if is_interrupt(err):
                 raise
+            shapes = {name: every[name].shape for name in names}
             raise InputError(
-                f"{self.name}: raises {type(err).__name__} on an image of shape "
-                f"{image.shape}: {err}"
+                f"{self.name}: raises {type(err).__name__} on arrays of the shapes "
+                f"{shapes}: {err}"
             ) from err

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import drjit as dr
@@ -10,6 +10,7 @@ import torch
 
 from mi_nerfattack.backend.torch_arrays import to_torch
 from mi_nerfattack.errors import InputError, is_interrupt
+from mi_nerfattack.policy.pilotnet import PilotNet
 
 #: Width and height of the images that public driving policies take, pixels.
 USUAL_PX = (
@@ -27,6 +28,10 @@ USUAL_PX = (
     (224, 224),
     (256, 256),
 )
+#: Part of the largest value by which two evaluations of one image may differ.
+TOLERANCE = 1e-4
+#: Part of the largest value by which the control may depend on the size of the batch.
+MIXED = 1e-2
 _CHANNELS = 16  # at most; a longer axis is one of pixels
 
 
@@ -59,61 +64,40 @@ def expand_goals(goal: Any, image: torch.Tensor) -> torch.Tensor:
     return values.expand(len(image))
 
 
-#: Column of a control, or columns of several; None where there is one column.
-Output = int | Sequence[int] | None
-#: Factor of a control, or one for each of several.
-Scale = float | Sequence[float]
-
-
-def chosen_controls(
-    values: torch.Tensor, count: int, output: Output, name: str
+def columns_of(
+    values: torch.Tensor, count: int, output: int | Sequence[int] | None, name: str
 ) -> torch.Tensor:
-    """Take the controls out of a network's answer, and refuse NaN.
+    """Take the control (n,), or several (n, k), out of an answer, and refuse NaN.
 
     Args:
-        values: (n,), (n, 1), or (n, j) where `output` is given; of one image also ()
-            and (j,).
+        values: (n,), (n, 1), or (n, k) where `output` is given; of one image also ()
+            and (k,).
         count: n.
-        output: column of the control, or k columns of several controls.
+        output: column of the control, or columns of several.
         name: of the policy, for messages.
-
-    Returns:
-        (n,), or (n, k) of several columns.
     """
     if count == 1 and values.ndim < 2:  # a network that drops axes of size 1
         values = values.reshape(1, -1)
     shape = tuple(values.shape)
-    several = isinstance(output, Sequence)
-    if shape != (count,) or several:
+    if shape != (count,):
         column = 0 if output is None and shape == (count, 1) else output
-        columns = list(column) if isinstance(column, Sequence) else [column]
-        if len(shape) != 2 or shape[0] != count or not _are_within(columns, shape[1]):
+        most = max(column) if isinstance(column, Sequence) else column
+        if len(shape) != 2 or shape[0] != count or most is None or most >= shape[1]:
             raise InputError(
                 f"{name}: controls {shape} for {count} images; the policy must return "
                 "one number for each image, (n,) or (n, 1), or several, (n, k), and "
-                f"policy.output (is {output}) must tell the column of the control, or "
-                "the columns where the vehicle has several controls"
+                f"policy.output (is {output}) must tell the column of the control"
             )
-        values = values[:, columns if several else columns[0]]
-    bad = (~torch.isfinite(values)).nonzero().tolist()
+        columns = list(column) if isinstance(column, Sequence) else column
+        values = values[:, columns]
+    finite = torch.isfinite(values)
+    bad = (~finite.reshape(count, -1).all(1)).nonzero().flatten().tolist()
     if bad:
-        value = float(values[tuple(bad[0])])
         raise InputError(
-            f"{name}: control {value} for image {bad[0][0]} of {count}; it must be "
-            "finite: check the weights and policy.preprocess"
+            f"{name}: control {values[bad[0]].tolist()} for image {bad[0]} of {count}; "
+            "it must be finite: check the weights and policy.preprocess"
         )
     return values
-
-
-def scaled(values: torch.Tensor, scale: Scale) -> torch.Tensor:
-    """Multiply controls (n,) or (n, k) by a factor, or by one for each of k."""
-    if isinstance(scale, Sequence):
-        return values * values.new_tensor(scale)
-    return scale * values
-
-
-def _are_within(columns: Sequence[int | None], count: int) -> bool:
-    return len(columns) > 0 and all(c is not None and c < count for c in columns)
 
 
 def misfit(wanted: Sequence[int | None], given: Sequence[int]) -> str:
@@ -186,3 +170,70 @@ def _remedy(wanted: Sequence[int | None]) -> str:
     if last:
         keys.append('layout = "NHWC"')
     return f"{', '.join(keys) or 'it so'} in [policy.preprocess]"
+
+
+def check_repeatable(
+    module: torch.nn.Module, evaluate: Callable[[], torch.Tensor], name: str
+) -> None:
+    """Refuse a module that answers the same image twice differently.
+
+    The loop evaluates a control period anew for its derivative, and begins every
+    drive with the same module. Buffers that change betray what no answer shows yet.
+
+    Args:
+        module: the module; `PilotNet` is known to be repeatable.
+        evaluate: gives the control (n,).
+        name: for messages.
+
+    Raises:
+        InputError: the two controls differ, or a buffer has changed.
+    """
+    if isinstance(module, PilotNet):
+        return
+    with torch.no_grad():
+        before = {key: value.clone() for key, value in module.named_buffers()}
+        first, second = evaluate(), evaluate()
+        changed = [
+            key
+            for key, value in module.named_buffers()
+            if key in before and not torch.equal(before[key].to(value), value)
+        ]
+        difference = float((first - second).abs().max())
+        limit = TOLERANCE * float(torch.maximum(first.abs(), second.abs()).max())
+    if changed or difference > limit:
+        what = f"its buffer {changed[0]!r} changes" if changed else "its controls are"
+        values = "" if changed else f" {first.tolist()[:2]}, then {second.tolist()[:2]}"
+        raise InputError(
+            f"{name}: evaluated twice on one image, {what}{values}; it was exported in "
+            "training mode (dropout, batch statistics): export network.eval(); or it "
+            "keeps a state in itself: take and return it as a hidden state, "
+            "policy.recurrent"
+        )
+
+
+def check_alone(
+    evaluate: Callable[[int], torch.Tensor], name: str, least: float
+) -> None:
+    """Refuse a network whose control for one image depends on the rest of the batch.
+
+    Args:
+        evaluate: gives the controls (n,) of the first n of two images.
+        name: for messages.
+        least: difference that rounding explains.
+
+    Raises:
+        InputError: the first control differs.
+    """
+    try:
+        with torch.no_grad():
+            (alone,), both = evaluate(1).tolist(), evaluate(2).tolist()
+    except InputError:  # it takes batches of another size, and will tell of them
+        return
+    scale = max(abs(alone), abs(both[1]), abs(both[1] - both[0]))
+    if abs(both[0] - alone) > MIXED * scale + least:
+        raise InputError(
+            f"{name}: the control for one image is {alone:.6g} alone and "
+            f"{both[0]:.6g} in a batch with another image, so vehicles would influence "
+            "each other; batch statistics do that: export network.eval(), and give "
+            "normalisation layers running statistics"
+        )

@@ -20,16 +20,18 @@ class DrJitNetwork(torch.nn.Module):
         network: a ``drjit.nn`` module with weights that are not packed, or any
             function that Dr.Jit differentiates. It maps a tensor (features, n) to
             (k, n). The features of an image are its values in the layout's order,
-            row by row, then those of a one-hot goal.
+            row by row, of several images one after the other, then numbers and those
+            of a one-hot goal.
     """
 
     def __init__(self, network: Callable[[Any], Any]) -> None:
         super().__init__()
         self.network = network
 
-    def forward(self, image: torch.Tensor, *goal: torch.Tensor) -> torch.Tensor:
+    def forward(self, image: torch.Tensor, *others: torch.Tensor) -> torch.Tensor:
         """Return (n, k)."""
-        features = torch.cat([image.flatten(1), *(g.to(image) for g in goal)], dim=1)
+        parts = (part.to(image).reshape(len(image), -1) for part in (image, *others))
+        features = torch.cat(list(parts), dim=1)
         result: Any = _Call.apply(self.network, features)
         return result
 

@@ -2,41 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
 import torch
 
-from mi_nerfattack.backend.torch_arrays import (
-    from_controls,
-    to_controls,
-    to_tensor,
-    to_torch,
-)
+from mi_nerfattack.backend.torch_arrays import to_controls, to_tensor, to_torch
 from mi_nerfattack.errors import InputError, is_interrupt
-from mi_nerfattack.policy.base import AbstractPolicy, Memory
+from mi_nerfattack.policy.action import Action
+from mi_nerfattack.policy.base import AbstractPolicy, Memory, Numbers
 from mi_nerfattack.policy.checks import (
-    Output,
-    Scale,
+    check_alone,
     check_hidden,
     check_images,
-    chosen_controls,
+    check_repeatable,
     expand_goals,
     misfit,
-    scaled,
     usual_shape,
 )
-from mi_nerfattack.policy.goals import AbstractGoal, declared_goal
+from mi_nerfattack.policy.inputs import AbstractGoal, Inputs, declared_goal
 from mi_nerfattack.policy.one_image import OneImage
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.preprocess import Preprocess
-
-#: Part of the largest value by which two evaluations of one image may differ.
-TOLERANCE = 1e-4
-#: Part of the largest value by which the control may depend on the size of the batch.
-MIXED = 1e-2
 
 
 def call_module(
@@ -83,74 +72,6 @@ def call_module(
     return _tensors(result, name)
 
 
-def check_repeatable(
-    module: torch.nn.Module, evaluate: Callable[[], torch.Tensor], name: str
-) -> None:
-    """Refuse a module that answers the same image twice differently.
-
-    The loop evaluates a control period anew for its derivative, and begins every
-    drive with the same module. Buffers that change betray what no answer shows yet.
-
-    Args:
-        module: the module; `PilotNet` is known to be repeatable.
-        evaluate: gives the control (n,) or (n, k).
-        name: for messages.
-
-    Raises:
-        InputError: the two controls differ, or a buffer has changed.
-    """
-    if isinstance(module, PilotNet):
-        return
-    with torch.no_grad():
-        before = {key: value.clone() for key, value in module.named_buffers()}
-        first, second = evaluate(), evaluate()
-        changed = [
-            key
-            for key, value in module.named_buffers()
-            if key in before and not torch.equal(before[key].to(value), value)
-        ]
-        difference = float((first - second).abs().max())
-        limit = TOLERANCE * float(torch.maximum(first.abs(), second.abs()).max())
-    if changed or difference > limit:
-        what = f"its buffer {changed[0]!r} changes" if changed else "its controls are"
-        values = "" if changed else f" {first.tolist()[:2]}, then {second.tolist()[:2]}"
-        raise InputError(
-            f"{name}: evaluated twice on one image, {what}{values}; it was exported in "
-            "training mode (dropout, batch statistics): export network.eval(); or it "
-            "keeps a state in itself: take and return it as a hidden state, "
-            "policy.recurrent"
-        )
-
-
-def check_alone(
-    evaluate: Callable[[int], torch.Tensor], name: str, least: float
-) -> None:
-    """Refuse a network whose control for one image depends on the rest of the batch.
-
-    Args:
-        evaluate: gives the controls (n,) or (n, k) of the first n of two images.
-        name: for messages.
-        least: difference that rounding explains.
-
-    Raises:
-        InputError: the first control differs.
-    """
-    try:
-        with torch.no_grad():
-            alone, both = evaluate(1).reshape(1, -1), evaluate(2).reshape(2, -1)
-    except InputError:  # it takes batches of another size, and will tell of them
-        return
-    for one, first, second in torch.cat([alone, both]).T.tolist():
-        scale = max(abs(one), abs(second), abs(second - first))
-        if abs(first - one) > MIXED * scale + least:
-            raise InputError(
-                f"{name}: the control for one image is {one:.6g} alone and {first:.6g} "
-                "in a batch with another image, so vehicles would influence each "
-                "other; batch statistics do that: export network.eval(), and give "
-                "normalisation layers running statistics"
-            )
-
-
 def _tensors(result: Any, name: str) -> tuple[torch.Tensor, ...]:
     """Take a tensor, or a tuple or list of them, and nothing else."""
     parts = tuple(result) if isinstance(result, (tuple, list)) else (result,)
@@ -169,15 +90,16 @@ _PLAIN = torch.contiguous_format
 class TorchPolicy(AbstractPolicy):
     """Policy given by a torch module; memory is shared, not copied, both ways.
 
-    The module is called as ``module(image, *goal, *hidden)`` and returns the control,
-    or a tuple of the control and the hidden states for the next image. It keeps no
-    state in itself; the very first image is evaluated twice to see that. The memory is
-    the frame stack, where there is one, and the hidden states.
+    The module is called as ``module(image, *goal, *hidden)``, or with what `inputs`
+    says before the hidden states, and returns the control, or a tuple of the control
+    and the hidden states for the next image. It keeps no state in itself; the very
+    first image is evaluated twice to see that. The memory is the frame stack of each
+    image, where there is one, and the hidden states.
 
     Args:
         module: takes what `preprocess` and `goal` make of the camera's image, (n, 3,
             height, width), sRGB in [0, 1], unless told otherwise, and gives controls
-            (n,), (n, 1), or (n, j) where `output` tells the column. It is switched to
+            (n,), (n, 1), or (n, k) where `output` tells the column. It is switched to
             evaluation mode, its parameters are frozen, and it is moved to the device
             of the images.
         goal: how the goal is passed; by default ``IntegerGoal(module.goals)`` if the
@@ -185,10 +107,8 @@ class TorchPolicy(AbstractPolicy):
         preprocess: from the camera's image to the network's.
         recurrent: shapes of the hidden states, zero at first, with -1 for the number
             of vehicles: ``[(-1, 64)]``, ``[(1, -1, 32)]``.
-        control_scale: factor from the module's unit and sign to the vehicle's; one,
-            or one for each control.
-        output: column of the control, needed where there are several; of a vehicle
-            with k > 1 controls the columns of these, which become (k, n).
+        action: what the answer means; by default it is the control.
+        inputs: what the module takes besides the hidden states, in its order.
         name: for messages; the module's class unless given.
     """
 
@@ -198,8 +118,8 @@ class TorchPolicy(AbstractPolicy):
         goal: AbstractGoal | None = None,
         preprocess: Preprocess | None = None,
         recurrent: Sequence[Sequence[int]] = (),
-        control_scale: Scale = 1.0,
-        output: Output = None,
+        action: Action | None = None,
+        inputs: Inputs | None = None,
         name: str | None = None,
     ) -> None:
         self.module: torch.nn.Module = module.eval()
@@ -208,8 +128,9 @@ class TorchPolicy(AbstractPolicy):
         self.goal: AbstractGoal = goal or declared_goal(module)
         self.preprocess: Preprocess = preprocess or Preprocess()
         self.recurrent: tuple[tuple[int, ...], ...] = check_hidden(recurrent)
-        self.control_scale: Scale = control_scale
-        self.output: Output = output
+        self.action: Action = action or Action()
+        self.inputs: Inputs = inputs or Inputs()
+        self.numbers: Numbers = self.inputs.numbers
         self.name: str = name or type(module).__name__
         self._checked = False
 
@@ -227,46 +148,77 @@ class TorchPolicy(AbstractPolicy):
         return to_controls(control, image), to_tensor(d_image, image)
 
     def initial_memory(self, count: int) -> Memory:
-        """Return an empty frame stack, where there is one, and zeros."""
+        """Return empty frame stacks, where there are any, and zeros."""
         like = self._precision()
-        stack = (torch.zeros(count, 0, 0, 0, 0, dtype=like),)
+        stacks = (
+            torch.zeros(count, 0, 0, 0, 0, dtype=like) for _ in range(self._stacks)
+        )
         hidden = (
             torch.zeros([count if size < 0 else size for size in shape], dtype=like)
             for shape in self.recurrent
         )
-        return (*(stack if self.preprocess.history else ()), *hidden)
+        return (*stacks, *hidden)
 
-    def step(self, image: Any, goal: Any, memory: Memory) -> tuple[Any, Memory]:
+    def step(
+        self, image: Any, goal: Any, memory: Memory, numbers: Any = None
+    ) -> tuple[Any, Memory]:
         """Evaluate the module without recording a graph."""
-        self._check(image, goal, memory)
+        told = None if numbers is None else to_torch(numbers)
+        self._check(image, goal, memory, told)
         with torch.no_grad():
-            control, after = self._evaluate(to_torch(image), goal, memory)
+            control, after = self._evaluate(to_torch(image), goal, memory, told)
         return to_controls(control, image), after
 
     def planes(self, image: Any, memory: Memory) -> np.ndarray:
-        """Return the stack of pre-processed frames, whatever their layout."""
+        """Return the stacks of pre-processed frames, whatever their layout.
+
+        Those of the first image, where the network takes several.
+        """
         images = to_torch(image)
         images = images.to(self._precision() or images.dtype)
-        return self.preprocess.planes(images, self._past(images, memory))
+        first, *_ = self.inputs.pictures(images).values()
+        return self.preprocess.planes(first, self._past(first, memory, 0))
 
     def step_vjp(
-        self, image: Any, goal: Any, memory: Memory, cotangent: Any, d_memory: Memory
-    ) -> tuple[Any, Memory]:
+        self,
+        image: Any,
+        goal: Any,
+        memory: Memory,
+        cotangent: Any,
+        d_memory: Memory,
+        numbers: Any = None,
+    ) -> tuple[Any, Memory, Any]:
         """Evaluate the module again and its reverse derivative, one graph at a time."""
-        _, (d_image, *rest) = self._pull_back(image, goal, memory, cotangent, d_memory)
-        return to_tensor(d_image, image), tuple(rest)
+        _, (d_image, *rest) = self._pull_back(
+            image, goal, memory, cotangent, d_memory, numbers
+        )
+        d_image = to_tensor(d_image, image)
+        if numbers is None:
+            return d_image, tuple(rest), None
+        *d_before, d_numbers = rest
+        return d_image, tuple(d_before), to_tensor(d_numbers, numbers)
 
     def _pull_back(
-        self, image: Any, goal: Any, memory: Memory, cotangent: Any, d_memory: Memory
+        self,
+        image: Any,
+        goal: Any,
+        memory: Memory,
+        cotangent: Any,
+        d_memory: Memory,
+        numbers: Any = None,
     ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
-        """Return the control, and derivatives by the image and each part of memory."""
-        self._check(image, goal, memory)
-        leaves = [
-            part.detach().requires_grad_(True) for part in (to_torch(image), *memory)
-        ]
+        """Return the control, and derivatives by image, memory parts and numbers."""
+        told = () if numbers is None else (to_torch(numbers),)
+        self._check(image, goal, memory, *told)
+        parts = (to_torch(image), *memory, *told)
+        leaves = [part.detach().requires_grad_(True) for part in parts]
+        end = 1 + len(memory)
         with torch.enable_grad(), self._plain_layers():
-            control, after = self._evaluate(leaves[0], goal, tuple(leaves[1:]))
-        weight = from_controls(cotangent).to(control)
+            control, after = self._evaluate(
+                leaves[0], goal, tuple(leaves[1:end]), *leaves[end:]
+            )
+        weight = to_torch(cotangent).to(control)
+        weight = weight if weight.ndim == 1 else weight.T
         if weight.shape != control.shape:
             raise InputError(
                 f"cotangent: {tuple(weight.shape)} for {tuple(control.shape)} controls"
@@ -289,19 +241,24 @@ class TorchPolicy(AbstractPolicy):
         ]
         return control, tuple(filled)
 
-    def _check(self, image: Any, goal: Any, memory: Memory) -> None:
+    def _check(
+        self, image: Any, goal: Any, memory: Memory, numbers: torch.Tensor | None = None
+    ) -> None:
         """Evaluate the very first image twice, alone, and with a darker one.
 
         A state in the module and batch statistics show themselves.
         """
         if not self._checked:
             images = to_torch(image)
-            check_repeatable(
-                self.module, lambda: self._evaluate(images, goal, memory)[0], self.name
-            )
+
+            def again() -> torch.Tensor:
+                return self._evaluate(images, goal, memory, numbers)[0]
+
+            check_repeatable(self.module, again, self.name)
             if not isinstance(self.module, PilotNet | OneImage):
                 goals = expand_goals(goal, images)[:1]
                 pair = torch.cat([images[:1], 0.25 * images[:1]])
+                one = None if numbers is None else numbers[:1]
                 parts = [
                     (part.narrow(axis, 0, 1), axis)
                     for part, axis in zip(memory, self._axes(), strict=True)
@@ -309,20 +266,32 @@ class TorchPolicy(AbstractPolicy):
 
                 def evaluate(count: int) -> torch.Tensor:
                     hidden = (torch.cat([part] * count, axis) for part, axis in parts)
-                    several = goals.expand(count)
-                    return self._evaluate(pair[:count], several, tuple(hidden))[0]
+                    told = None if one is None else one.expand(count, -1)
+                    found, _ = self._evaluate(
+                        pair[:count], goals.expand(count), tuple(hidden), told
+                    )
+                    return found if found.ndim == 1 else found[:, 0]
 
-                largest = float(np.abs(self.control_scale).max())
+                scale = self.action.scale
+                largest = max(map(abs, scale if isinstance(scale, tuple) else (scale,)))
                 check_alone(evaluate, self.name, 1e-6 * largest)
             self._checked = True
 
+    @property
+    def _stacks(self) -> int:
+        """Number of frame stacks in the memory."""
+        return len(self.inputs.images) if self.preprocess.history else 0
+
     def _axes(self) -> list[int]:
         """Return the axis of the vehicles in each part of the memory."""
-        stack = [0] if self.preprocess.history else []
-        return [*stack, *(shape.index(-1) for shape in self.recurrent)]
+        return [0] * self._stacks + [shape.index(-1) for shape in self.recurrent]
 
     def _evaluate(
-        self, image: torch.Tensor, goal: Any, memory: Memory
+        self,
+        image: torch.Tensor,
+        goal: Any,
+        memory: Memory,
+        numbers: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, Memory]:
         """Apply the module to (n, height, width, 3), in the module's precision."""
         check_images(image)
@@ -330,13 +299,24 @@ class TorchPolicy(AbstractPolicy):
             self.module.to(image.device)
         image = image.to(self._precision() or image.dtype)
         memory = tuple(part.to(image) for part in memory)
-        planes = self.preprocess.transform(image)
-        past = self._past(planes, memory)
-        network_image, past = self.preprocess.stack(planes, past)
-        hidden = memory[1:] if self.preprocess.history else memory
+        numbers = None if numbers is None else numbers.to(image)
+        # Images, of each camera its own stack of frames
+        seen, stacks = {}, []
+        for index, (name, picture) in enumerate(self.inputs.pictures(image).items()):
+            planes = self.preprocess.transform(picture)
+            past = self._past(planes, memory, index)
+            seen[name], past = self.preprocess.stack(planes, past)
+            stacks.append(past)
+        stacks, hidden = stacks[: self._stacks], memory[self._stacks :]
+        # Network
         goals = self.goal.arguments(expand_goals(goal, image), image)
-        outputs = call_module(self.module, self.name, network_image, *goals, *hidden)
-        control = chosen_controls(outputs[0], len(image), self.output, self.name)
+        arguments = self.inputs.arguments(seen, goals, numbers)
+        outputs = call_module(self.module, self.name, *arguments, *hidden)
+        # Controls
+        speed = None
+        if self.action.needs_speed:
+            speed = self.inputs.told(numbers)["speed"][:, 0]
+        control = self.action.controls(outputs[0], len(image), speed, self.name)
         after = outputs[1:]
         shapes = [tuple(part.shape) for part in after]
         if shapes != [tuple(part.shape) for part in hidden]:
@@ -346,12 +326,11 @@ class TorchPolicy(AbstractPolicy):
                 "shapes as policy.recurrent, or return several controls as one tensor "
                 "(n, k) and tell the column by policy.output"
             )
-        stack = (past,) if self.preprocess.history else ()
-        return scaled(control, self.control_scale), (*stack, *after)
+        return control, (*stacks, *after)
 
-    def _past(self, like: torch.Tensor, memory: Memory) -> torch.Tensor:
-        """Return earlier frames of the stack; none where there is no stack."""
-        return memory[0] if self.preprocess.history else like.new_zeros(0, 0)
+    def _past(self, like: torch.Tensor, memory: Memory, index: int) -> torch.Tensor:
+        """Return earlier frames of a stack; none where there is no stack."""
+        return memory[index] if self.preprocess.history else like.new_zeros(0, 0)
 
     def _plain_layers(self) -> AbstractContextManager[None]:
         """Switch cuDNN off for recurrent layers: it differentiates none in evaluation.

@@ -141,7 +141,8 @@ class Checkpointed(AbstractAdjoint):
                 kept.append((sensor.keep(seen), memory))
                 if index + 1 < end:
                     image = loop.shown(seen, index)
-                    _, memory = loop.policy.step(image, loop.goal, memory)
+                    numbers = loop.numbers(drive.states[index], index)
+                    _, memory = loop.policy.step(image, loop.goal, memory, numbers)
                 del seen
             for index in reversed(range(start, end)):
                 view, memory = kept.pop()

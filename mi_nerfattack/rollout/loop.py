@@ -13,9 +13,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
+from mi_nerfattack.backend.arrays import vjp
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.notebook import picture
+from mi_nerfattack.policy.base import Numbers
 from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.rollout.objective import StateHistory
 from mi_nerfattack.rollout.sensor import (
@@ -31,6 +35,7 @@ from mi_nerfattack.vehicle.dynamics import (
     to_state,
 )
 from mi_nerfattack.vehicle.integrators import AbstractIntegrator, Transition
+from mi_nerfattack.vehicle.route.route import Route
 
 OnStep = Callable[[int], None]
 
@@ -54,6 +59,7 @@ class ClosedLoop:
         eight_bit: round images as a camera does; without it the policy gets what the
             sensor renders, and derivatives equal finite differences.
         disturbance: of the sensor's images, before they are rounded; a row a vehicle.
+        route: that a policy is told points of; needed where it asks for them.
     """
 
     sensor: AbstractSensor
@@ -66,6 +72,7 @@ class ClosedLoop:
     delay: int = 0
     eight_bit: bool = True
     disturbance: Disturbance = Disturbance()
+    route: Route | None = None
     transition: Transition = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -95,11 +102,42 @@ class ClosedLoop:
         """Upload initial poses (n, 3), metres and radians, as full states (m, n)."""
         return to_state(self.dynamics.extend(np.atleast_2d(poses)))
 
+    def numbers(self, state: Any, step: int) -> Any:
+        """Return what the policy is told besides images, (n, k), evaluated; or None.
+
+        Args:
+            state: (m, n) before the period.
+            step: index of the control period.
+        """
+        if not self.policy.numbers:
+            return None
+        with dr.suspend_grad():
+            return stacked(self._told(dr.detach(state), step))
+
+    def numbers_vjp(self, state: Any, step: int, d_numbers: Any) -> Any:
+        """Return the derivative by the state, (m, n), from that by the numbers."""
+        kind, size = dr.detached_t(type(state[0])), self.policy.numbers.size
+        index = size * dr.arange(dr.uint32_array_t(kind), dr.width(state))
+        array = d_numbers.array
+        weights = [kind(dr.gather(type(array), array, index + i)) for i in range(size)]
+
+        def weighed(leaf: Any) -> Any:
+            pairs = zip(weights, self._told(leaf, step), strict=True)
+            # not every number depends on the state: a speed may be constant
+            return sum((weight * row for weight, row in pairs), 0 * leaf[0])
+
+        return vjp(weighed, state, 1)
+
+    def _told(self, state: Any, step: int) -> list[Any]:
+        """Return the numbers as rows (n,), differentiable in the state (m, n)."""
+        speed = self.dynamics.speed_of(state) if self.policy.numbers.speed else None
+        return numbers_of(self.policy.numbers, state, speed, step * self.dt, self.route)
+
     def shown(self, observation: Observation, step: int) -> Any:
         """Return the image that the policy gets, (n, height, width, 3), evaluated."""
         image = observation.image
         if self.disturbance:
-            image = self.disturbance.apply(image, step)
+            image = self.disturbance.apply(image, step, self.sensor.layout)
         if self.eight_bit:
             # a literal would be multiplied by its inverse, which is off in the last bit
             most = dr.opaque(type(image.array), 255)
@@ -111,7 +149,47 @@ class ClosedLoop:
         """Return the derivative by the sensor's image from that by the policy's."""
         if not self.disturbance:
             return d_shown
-        return self.disturbance.vjp(observation.image, step, d_shown)
+        layout = self.sensor.layout
+        return self.disturbance.vjp(observation.image, step, d_shown, layout)
+
+
+def numbers_of(
+    numbers: Numbers, state: Any, speed: Any, time: float, route: Route | None
+) -> list[Any]:
+    """Return the numbers that a policy asks for, as rows (n,) in its order.
+
+    Args:
+        numbers: what it asks for.
+        state: (m, n), its first rows px, py (metres) and theta (radians).
+        speed: (n,), metres per second; not read unless asked for.
+        time: seconds since the start.
+        route: that points are told of.
+
+    Raises:
+        InputError: the policy asks for points, and there is no route.
+    """
+    rows = [speed] if numbers.speed else []
+    if numbers.route_m:
+        if route is None:
+            raise InputError("route: the policy is told points of it; give it one")
+        rows += route.ahead(state, numbers.route_m)
+    if numbers.time:
+        row = dr.detached_t(type(state[0]))
+        rows.append(dr.opaque(row, time, dr.width(state)))
+    return rows
+
+
+def stacked(rows: Sequence[Any]) -> Any:
+    """Lay rows (n,) side by side: a tensor (n, k) in double precision, evaluated."""
+    kind: Any = dr.float64_array_t(mi.TensorXf)
+    row = dr.array_t(kind)
+    count, size = dr.width(rows[0]), len(rows)
+    result = dr.empty(row, count * size)
+    index = size * dr.arange(mi.UInt32, count)
+    for column, values in enumerate(rows):
+        dr.scatter(result, row(values), index + column)
+    dr.eval(result)
+    return kind(result, (count, size))
 
 
 @dataclass(frozen=True)
@@ -262,8 +340,8 @@ def simulate(
         seen = still or loop.sensor.observe(view, period)
         still = None if camera.frame is None else seen
         step = Step(index, states[-1], seen, memory)
-        image = loop.shown(seen, index)
-        control, memory = loop.policy.step(image, loop.goal, memory)
+        image, numbers = loop.shown(seen, index), loop.numbers(states[-1], index)
+        control, memory = loop.policy.step(image, loop.goal, memory, numbers)
         require_controls(control_size(control), loop.dynamics.control_names)
         controls.append(controls_as(dr.value_t(type(initial)), control))
         older, newer = loop.transition.controls(controls, index, initial)

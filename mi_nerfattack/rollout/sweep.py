@@ -123,7 +123,8 @@ class Sweep:
         attached: whether images follow the state.
         together: control periods whose images go through the policy at once, and whose
             observations are held until then; 1 where images follow the state, or the
-            gradient is taken apart. With memory, a policy takes them one by one.
+            gradient is taken apart. With memory, or numbers besides the images, a
+            policy takes them one by one.
         on_image: called with the index of a period and the derivative by what the
             sensor gave there, a tensor (n, height, width, 3).
         pending: derivatives by controls that act in periods already visited.
@@ -137,7 +138,7 @@ class Sweep:
     on_image: Callable[[int, Any], None] | None = None
     pending: dict[int, Any] = field(default_factory=dict)
     d_memory: tuple[Any, ...] = ()
-    _waiting: list[tuple[Step, Any, Any]] = field(default_factory=list)
+    _waiting: list[tuple[Step, Any, Any, Any]] = field(default_factory=list)
     _d_still: Any = None  # by the only frame of a drive, of all periods so far
 
     def __post_init__(self) -> None:
@@ -162,11 +163,14 @@ class Sweep:
         none = no_control(loop.dynamics.control_size, d_state)
         cotangent = controls_as(dr.array_t(image), self.pending.pop(index, none))
         dr.eval(cotangent)
-        self._waiting.append((step, image, cotangent))
-        alone = bool(step.memory or self.d_memory)
+        numbers = loop.numbers(step.state, index)
+        self._waiting.append((step, image, cotangent, numbers))
+        alone = bool(step.memory or self.d_memory) or numbers is not None
         # Policy and sensor: several periods at a time
         full = alone or len(self._waiting) == self.together
-        by_pose = self.finish() if full else None
+        by_pose, by_numbers = self.finish() if full else (None, None)
+        if by_numbers is not None:
+            d_state += by_numbers
         if by_pose is not None:
             for axis in range(3):
                 d_state[axis] += by_pose[axis]
@@ -189,26 +193,30 @@ class Sweep:
             self.pending[source] = self.pending.get(source, 0) + value
         return d_state
 
-    def finish(self) -> Any:
+    def finish(self) -> tuple[Any, Any]:
         """Go back through policy and sensor, from all periods that wait for that.
 
         Returns:
-            (3, n), by the pose before the last of them; None when not `attached`.
+            By the state before the last of them: (3, n) through its image, None when
+            not `attached`; (m, n) through what else the policy is told, or None.
         """
         if not self._waiting:
-            return None
-        steps, images, cotangents = zip(*self._waiting, strict=True)
+            return None, None
+        steps, images, cotangents, numbers = zip(*self._waiting, strict=True)
         self._waiting.clear()
-        loop, by_pose = self.loop, None
-        # Policy: from controls to images
-        d_images, self.d_memory = loop.policy.step_vjp(
+        loop, by_pose, by_numbers, last = self.loop, None, None, steps[-1]
+        # Policy: from controls to images and numbers
+        d_images, self.d_memory, d_numbers = loop.policy.step_vjp(
             _batch(images),
             loop.goal,
-            steps[-1].memory,
+            last.memory,
             _batch(cotangents),
             self.d_memory,
+            numbers[-1],
         )
         release_heap()
+        if d_numbers is not None:
+            by_numbers = loop.numbers_vjp(last.state, last.index, d_numbers)
         for step, d_image in zip(steps, _unbatch(d_images, len(steps)), strict=True):
             # Camera: through disturbance and eight bits (straight through)
             d_seen = loop.shown_vjp(step.observation, step.index, d_image)
@@ -224,7 +232,7 @@ class Sweep:
                 previous = self._d_still
                 self._d_still = d_seen if previous is None else previous + d_seen
                 dr.eval(self._d_still)
-        return by_pose
+        return by_pose, by_numbers
 
     def finish_still(self) -> None:
         """Go back through the sensor from the only frame, for all periods so far."""
@@ -321,7 +329,8 @@ def backward_to_images(
             found[index] = d_image.numpy().copy()
 
     sweep = Sweep(loop, drive, attached, on_image=keep)
-    linked = attached or bool(loop.policy.initial_memory(drive.count))
+    policy = loop.policy
+    linked = attached or bool(policy.initial_memory(drive.count) or policy.numbers)
     d_before, start = to_state(np.zeros_like(d_states[0])), min(steps, default=0)
     try:
         sensor.start_gradient()

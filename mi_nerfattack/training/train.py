@@ -336,10 +336,10 @@ def check_site(site: AbstractSite) -> None:
             "--frames-only') and train your own network"
         )
     height, width = IMAGE_SHAPE
-    camera = site.camera
-    if (camera.width, camera.height) != (width, height):
+    if site.rig.size != (width, height):
+        wide, high = site.rig.size
         raise InputError(
-            f"camera of {site.name!r}: {camera.width} x {camera.height} px; PilotNet "
+            f"camera of {site.name!r}: {wide} x {high} px; PilotNet "
             f"takes {width} x {height}: change the camera, or collect frames alone "
             "('mi-nerfattack train --frames-only') and train your own network"
         )

@@ -25,7 +25,7 @@ from mi_nerfattack.evaluation import work as evaluate_work
 from mi_nerfattack.fields.io import save_field
 from mi_nerfattack.io import files
 from mi_nerfattack.report.pages.policy import policy_name, summary
-from mi_nerfattack.scenario.policy import HttpSection, ProgramSection
+from mi_nerfattack.scenario.policy.kinds import HttpSection, ProgramSection
 from mi_nerfattack.scenes import bundled
 from mi_nerfattack.system.workers import InThisProcess, Processes
 
@@ -335,4 +335,4 @@ def test_set_keys_come_before_those_of_the_file():
     assert file.vehicle is not None and file.vehicle.width_m == 0.25
     own = PolicyFile.read("mine.pt2", ["policy.kind=exported", "camera.width=80"])
     assert own.policy is not None and own.policy.kind == "exported"
-    assert own.camera is not None and own.camera[0].width == 80
+    assert own.rig is not None and own.rig.size[0] == 80

@@ -16,7 +16,8 @@ from support.worlds.loops import ADJOINTS, Wave, assert_close, expected_gradient
 from torch import nn
 
 from mi_nerfattack.policy import preprocess as pre
-from mi_nerfattack.policy.goals import IntegerGoal, NoGoal, OneHotGoal
+from mi_nerfattack.policy.action import Action
+from mi_nerfattack.policy.inputs import IntegerGoal, NoGoal, OneHotGoal
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.rollout.function import Rollout
@@ -63,7 +64,10 @@ class Recurrent(nn.Module):
 def recurrent(dtype=torch.float32):
     shapes = [(1, -1, 5), (1, -1, 5)]
     return TorchPolicy(
-        Recurrent().to(dtype), OneHotGoal(2), recurrent=shapes, control_scale=-0.5
+        Recurrent().to(dtype),
+        OneHotGoal(2),
+        recurrent=shapes,
+        action=Action(scale=-0.5),
     )
 
 
@@ -111,7 +115,7 @@ def test_reverse_mode_of_a_step_equals_differences(make, dtype, rng):
         pairs = zip(parts, d_after, strict=True)
         return control.numpy() @ weight + sum(float((p * d).sum()) for p, d in pairs)
 
-    d_image, d_memory = policies[dtype].step_vjp(
+    d_image, d_memory, _ = policies[dtype].step_vjp(
         tensor(image), 1, memory, row(weight), d_after
     )
     assert type(d_image) is type(tensor(image))
@@ -140,7 +144,7 @@ def test_planes_are_the_stack_after_its_transforms(rng):
     stack = pre.Preprocess(
         [pre.Crop(2, 0, 1, 1), pre.to_grey()], frames=3, layout=pre.channels_last
     )
-    policy = TorchPolicy(nn.Flatten(), NoGoal(), stack, output=0)
+    policy = TorchPolicy(nn.Flatten(), NoGoal(), stack, action=Action(output=0))
     images = [rng.random((2, *SIZE, 3), "f4") for _ in range(4)]
     memory = policy.initial_memory(2)
     for image in map(mi.TensorXf, images[:3]):
@@ -196,7 +200,9 @@ def policies():
     stack = pre.Preprocess(transforms, 3, 2)
     return {
         "recurrent": TorchPolicy(Gated().double(), OneHotGoal(3), recurrent=[(-1, 6)]),
-        "stacked": TorchPolicy(Dense().double(), NoGoal(), stack, control_scale=-1.5),
+        "stacked": TorchPolicy(
+            Dense().double(), NoGoal(), stack, action=Action(scale=-1.5)
+        ),
     }
 
 
@@ -221,7 +227,7 @@ class Carried(nn.Module):
         result = policy.module(stack, *goals, *hidden)
         result = result if isinstance(result, tuple) else (result,)
         self.hidden = list(result[1:])
-        return policy.control_scale * result[0][:, 0]
+        return policy.action.scale * result[0][:, 0]
 
 
 def make_pair(name):

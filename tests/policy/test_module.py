@@ -10,9 +10,10 @@ from torch import nn
 from torch.nn import functional
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.policy.goals import IntegerGoal, NoGoal
+from mi_nerfattack.policy.action import Action
+from mi_nerfattack.policy.inputs import IntegerGoal, NoGoal
 from mi_nerfattack.policy.torch_policy import TorchPolicy
-from mi_nerfattack.scenario.policy import load_policy
+from mi_nerfattack.scenario.policy.kinds import load_policy
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -63,7 +64,7 @@ def test_networks_that_write_in_place_change_nothing_of_the_loop(rng):
     memory = made.initial_memory(2)
     for _ in range(2):
         control, after = made.step(image, 0, memory)
-        d_image, _ = made.step_vjp(image, 0, memory, mi.Float(1, 1), ())
+        d_image, *_ = made.step_vjp(image, 0, memory, mi.Float(1, 1), ())
         np.testing.assert_array_equal(image.numpy(), before)
         assert not memory[0].any() and bool((after[0] == 1).all())
         np.testing.assert_allclose(control, 0.5 * before.mean((1, 2, 3)), rtol=1e-5)
@@ -101,7 +102,7 @@ HIDDEN = {"recurrent": [(-1, 4)]}
         (bright, {}, "ValueError: too bright"),
         (lambda x: x.mean(), {}, r"controls \(\) for 2 images"),
         (lambda x: x.mean((2, 3)), {}, r"controls \(2, 3\).*policy.output"),
-        (lambda x: x.mean((2, 3)), {"output": 3}, r"output \(is 3\)"),
+        (lambda x: x.mean((2, 3)), {"action": Action(output=3)}, r"output \(is 3\)"),
         (lambda x: mean(x) / 0, {}, "inf for image 0"),
         (lambda x, h: (mean(x), h[:1]), HIDDEN, r"\[\(1, 4\)\] .* \[\(2,"),
         (lambda x, h: mean(x), HIDDEN, r"hidden states \[\]"),
@@ -185,7 +186,7 @@ def test_vehicles_that_influence_each_other_are_refused(answer, arguments, count
 @pytest.mark.parametrize("output", [0, 1])
 def test_a_network_may_drop_axes_of_one_image(output, rng):
     axes = (2, 3) if output else (1, 2, 3)
-    made = policy(lambda x: x.mean(axes).squeeze(), control_scale=-2.0, output=output)
+    made = policy(lambda x: x.mean(axes).squeeze(), action=Action(output, -2.0))
     image = images(rng, 1)
     column = image.numpy()[..., 1] if output else image.numpy()
     control, d_image = made.vjp(image, 0, mi.Float(1))
@@ -216,9 +217,8 @@ def test_a_module_says_how_it_takes_the_goal(line, goal, tmp_path):
 def test_several_controls_are_rows_and_go_back(rng):
     """Columns in any order, each with a scale; the derivative is autograd's."""
     weight = torch.randn(3, 3, generator=torch.Generator().manual_seed(1))
-    made = policy(
-        lambda x: x.mean((2, 3)) @ weight, output=(2, 0), control_scale=(2.0, -0.5)
-    )
+    action = Action((2, 0), (2.0, -0.5))
+    made = policy(lambda x: x.mean((2, 3)) @ weight, action=action)
     image = images(rng)
     rows = made.control(image, 0)
     means = torch.tensor(image.numpy().mean((1, 2)))
@@ -231,4 +231,4 @@ def test_several_controls_are_rows_and_go_back(rng):
     expected = np.broadcast_to(by_mean[:, None, None] / np.prod(SIZE), found.shape)
     np.testing.assert_allclose(found, expected, rtol=1e-5)
     with pytest.raises(InputError, match=r"output \(is \(3, 0\)\)"):
-        policy(lambda x: x.mean((2, 3)), output=(3, 0)).control(image, 0)
+        policy(lambda x: x.mean((2, 3)), action=Action((3, 0))).control(image, 0)

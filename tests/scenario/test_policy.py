@@ -22,7 +22,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.io.strict import parse_toml
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.torch_policy import TorchPolicy
-from mi_nerfattack.scenario.policy import PolicySection, PreprocessSection
+from mi_nerfattack.scenario.policy.kinds import PolicySection, PreprocessSection
 from mi_nerfattack.scenario.scenario import load_scenario
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -77,7 +77,7 @@ def test_examples_of_the_guide(blocks, toml, tmp_path, monkeypatch, served, rng)
         control, after = policy.step(image, 1, memory)
         assert control.numpy().shape == (2,) and np.isfinite(control.numpy()).all()
         if policy.differentiable:
-            d_image, d_memory = policy.step_vjp(image, 1, memory, mi.Float(1, 1), ())
+            d_image, d_memory, _ = policy.step_vjp(image, 1, memory, mi.Float(1, 1), ())
             assert d_image.shape == image.shape and np.any(d_image.numpy())
             assert len(d_memory) == len(memory)
         memory = after

@@ -22,6 +22,12 @@ name = "test" -> attack.method.max_iterations = 0; name = "a" => :1: attack.meth
 [camera]; fy = 200 => camera.fy: .*without fx
 [camera]; fx = 0 => camera.fx: .*greater
 [camera]; k1 = -3 => camera.k1: .*folds
+[camera]; yaw_deg = 200 => camera.yaw_deg: .*180
+[camera]; name = "front" => camera.name: unknown key; .*left_m
+[[cameras]]; width = 8 => :13: cameras.0.name: is missing
+[[cameras]]; name = "a b" => :14: cameras.0.name: .*pattern
+[[cameras]]; name = "a"; [camera]; width = 8 => cameras: stands beside .camera.
+[[cameras]]; name = "a"; [[cameras]]; name = "a" => cameras: .*must differ
 [attack.method]; max_iteratons = 3 => :14: attack.method.max_iteratons: .*max_iterations
 [attack.method]; max_iterations = 0 => method.max_iterations: .*0
 [attack.method]; max_iterations = "3" => method.max_iterations: .*integer
@@ -73,8 +79,8 @@ route = "lane" -> => :2: scene.route: is missing
   control_unit = "other"; [policy]; file = "a.pt"; control_unit = "rad"
   => vehicle.kind: custom takes other, and a.pt gives rad; .*control_scale
 [vehicle]; kind = "kinematic_single_track"; [policy]; file = "a.pt"
-  => policy.output: says 1 .*takes 2: steering, acceleration
-[policy]; file = "a.pt"; output = [0, 1] => policy.output: says 2 .*1: heading_rate
+  => policy.output: .*gives 1, .*takes 2: steering, acceleration
+[policy]; file = "a.pt"; output = [0, 1] => policy.output: .*gives 2, .*1: heading_rate
 [policy]; file = "a.pt"; output = [0, -1] => policy.output.1: .*equal to 0
 [vehicle]; delay_steps = -1 => vehicle.delay_steps: .*0
 [vehicle]; kind = "ackermann_rate"; steer_time_s = 0.03; substeps = 1

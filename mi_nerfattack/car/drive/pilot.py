@@ -109,9 +109,17 @@ def policy_control(policy: AbstractPolicy, goal: int) -> Callable[[np.ndarray], 
     Args:
         policy: one with memory starts with its initial one.
         goal: of the route.
+
+    Raises:
+        InputError: the policy is told more than images and goal.
     """
     from mi_nerfattack.deploy.environment import policy_image
 
+    if policy.numbers:
+        raise InputError(
+            f"policy: it is told {', '.join(policy.numbers.columns)}, which the car "
+            "does not measure; drive it in simulation, or give a policy of images"
+        )
     memory = policy.initial_memory(1)
 
     def control(image: np.ndarray) -> float:

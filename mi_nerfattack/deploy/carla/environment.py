@@ -30,6 +30,7 @@ from mi_nerfattack.render.camera.intrinsics import (
     camera_to_body,
     planar_body,
 )
+from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.vehicle.route.route import Route
 
 VEHICLE = "vehicle.tesla.model3"
@@ -77,6 +78,7 @@ class CarlaEnvironment(AbstractEnvironment):
     ) -> None:
         field_of_view_deg(camera)
         self.camera, self.period, self.driver = camera, period, driver
+        self.rig = Rig.of_one(camera, mount)
         self.max_control = driver.max_control
         self.control_unit = driver.control_unit
         self.more_controls = driver.more_controls
@@ -127,6 +129,11 @@ class CarlaEnvironment(AbstractEnvironment):
         if self._cameras is None:
             raise InputError("environment 'carla': it has a state only after reset")
         return self.driver.vehicle.state
+
+    @property
+    def speed(self) -> float:
+        """Speed of the model."""
+        return self.driver.vehicle.speed
 
     def show(self, objects: Sequence[Any]) -> None:
         """Paste fields by depth."""

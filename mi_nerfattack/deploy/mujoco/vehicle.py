@@ -211,6 +211,11 @@ class MujocoVehicle(AbstractVehicle):
         )
 
     @property
+    def speed(self) -> float:
+        """Speed of the rear axle."""
+        return float(self.state[3])
+
+    @property
     def body_to_world(self) -> np.ndarray:
         """Pose (4, 4) of the body, with its pitch and roll."""
         self._require_reset()

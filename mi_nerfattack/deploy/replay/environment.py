@@ -21,6 +21,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.io.video import VIDEO_SUFFIXES
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
+from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.vehicle.route.route import Route
 
 
@@ -59,6 +60,7 @@ class ReplayEnvironment(AbstractEnvironment):
         if not 0 < period < math.inf:
             raise InputError(f"period: {period}; a positive time, seconds")
         self.recording, self.camera = recording, recording.camera
+        self.rig = Rig.of_one(recording.camera, mount)
         self.period, self.max_control = period, max_control
         self.control_unit, self.more_controls = control_unit, more_controls
         self.controls: list[float | np.ndarray] = []
@@ -98,6 +100,16 @@ class ReplayEnvironment(AbstractEnvironment):
         if self._index < 0:
             raise InputError("environment 'replay': it has a state only after reset")
         return self._states[self._index].copy()
+
+    @property
+    def speed(self) -> float:
+        """Speed between the frames before and after, along the heading."""
+        track, last = self.recording.track, len(self._states) - 1
+        before, after = max(self._index - 1, 0), min(self._index + 1, last)
+        moved = self._states[after, :2] - self._states[before, :2]
+        heading = self.state[2]
+        along = moved @ np.array([math.cos(heading), math.sin(heading)])
+        return float(along / (track.times[after] - track.times[before]))
 
     @property
     def is_over(self) -> bool:

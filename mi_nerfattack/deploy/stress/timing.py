@@ -30,6 +30,7 @@ class AbstractAround(AbstractEnvironment):
 
     def __init__(self, inside: AbstractEnvironment) -> None:
         self.inside, self.name, self.camera = inside, inside.name, inside.camera
+        self.rig = inside.rig
         self.period, self.max_control = inside.period, inside.max_control
         self.control_unit = inside.control_unit
         self.more_controls = inside.more_controls
@@ -48,6 +49,11 @@ class AbstractAround(AbstractEnvironment):
     def state(self) -> np.ndarray:
         """State (m,) of the vehicle, as it is."""
         return self.inside.state
+
+    @property
+    def speed(self) -> float:
+        """Speed of the vehicle, as it is."""
+        return self.inside.speed
 
     @property
     def is_over(self) -> bool:

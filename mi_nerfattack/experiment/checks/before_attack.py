@@ -175,7 +175,7 @@ def speed_findings(world: World) -> Iterator[str]:
     scene, drive, period = scenario.scene, scenario.drive, scenario.vehicle.dt_s
     route = Route.from_file(scene.routes.file, scene.route)
     state = to_state(dynamics.extend(world.initial[:1]))
-    speed = float(dynamics.speed(state).numpy()[0])
+    speed = float(dynamics.speed_of(state)[0])
     if np.isclose(speed, route.speed_ms, rtol=_SPEEDS):
         return
     horizon, expected = world.horizon, drive.steps(route, period)
@@ -247,7 +247,7 @@ def view_findings(world: World, first: Drive) -> Iterator[str]:
 def changeable_share(
     world: World, fields: Sequence[GridField], pose: np.ndarray, step: int
 ) -> float:
-    """Return the share of the pixels that the textures of objects can change.
+    """Return the share of the first camera's pixels that textures can change.
 
     Args:
         world: of the attack; the fields keep another texture.
@@ -255,7 +255,7 @@ def changeable_share(
         pose: (3,) of the vehicle.
         step: control period, of the rays.
     """
-    sensor, state = world.surrogate, to_state(pose[None])
+    sensor, state = world.surrogate.through(0), to_state(pose[None])
     images = []
     for raw in (_RAW, -_RAW):
         for field in fields:

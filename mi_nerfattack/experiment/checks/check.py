@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.deploy.environment import (
@@ -18,6 +17,7 @@ from mi_nerfattack.deploy.environment import (
     CameraFrame,
     OpenEnvironment,
     drive,
+    first_frame,
     policy_image,
 )
 from mi_nerfattack.deploy.views.above import scene_above, surrogate_above
@@ -43,7 +43,6 @@ from mi_nerfattack.report.plots.place import Look, Overlay, place_picture
 from mi_nerfattack.rollout.drive import OWN, Drive, departure_limit
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import World
-from mi_nerfattack.vehicle.dynamics import controls_as, to_control
 
 _LONGEST_PX = 560  # of the pictures from above
 _CHASE = 400, 200, 75.0  # pixels and field of view
@@ -100,16 +99,18 @@ class Check:
             self._told(lambda: self._slope(base))
         for label, frame in self.frames.items():
             if label != SURROGATE and base is not None:
-                camera = world.surrogate.intrinsics
-                found = likeness_findings(camera, base, frame, label)
+                camera, layout = world.surrogate.intrinsics, world.place.rig.layout
+                pair = first_frame(base, layout), first_frame(frame, layout)
+                found = likeness_findings(camera, *pair, label)
                 self.doubts += found
 
     def _slope(self, frame: CameraFrame) -> None:
         """Look whether the control has a derivative by the first image."""
-        image, goal = policy_image(frame.image), self.world.route.goal
-        ones = np.ones((1, self.world.motion.dynamics.control_size))
-        cotangent = controls_as(mi.Float, to_control(ones))
-        _, d_image = self.world.policy.vjp(image, goal, cotangent)
+        policy, loop = self.world.policy, self.world.loop(self.world.surrogate)
+        numbers = loop.numbers(loop.initial(self.world.initial[:1]), 0)
+        given = policy_image(frame.image), loop.goal, policy.initial_memory(1)
+        control, _ = policy.step(*given, numbers)
+        d_image, *_ = policy.step_vjp(*given, 0 * control + 1, (), numbers)
         if not d_image.numpy().any():
             self.doubts.append(
                 "the derivative of the policy's control by the first image is exactly "
@@ -209,7 +210,9 @@ class Check:
         grounds = {"Surrogate, from above": surrogate_above(world.surrogate, overhead)}
         looks = {
             f"First image in {label}": Look(
-                frame.image, world.surrogate.intrinsics, frame.camera_to_world
+                first_frame(frame, world.place.rig.layout).image,
+                world.surrogate.intrinsics,
+                frame.camera_to_world,
             )
             for label, frame in list(self.frames.items())[:2]
         }

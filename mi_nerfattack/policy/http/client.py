@@ -8,16 +8,18 @@ Every control period the client posts the images::
     X-Client: 5f0c...             a random number of the client
     X-Goal: 0,0                   the goal of each image
     X-Step: 3                     images before this one in the drive; 0 starts a drive
+    X-Numbers: 5.1,9.8,0.2;4.9,9.7,0.1   where the policy is told speed, points of the
+                                  route, time: those of each image, as in `Numbers`
     (body: a NumPy array in .npy format, (n, c, h, w) or as declared; float32, or uint8
     of a car's camera, for value/255)
 
     200 OK
     {"control": [0.12, -0.03]}
 
-The control is one JSON number for each image, or a list of `k` for each; the client
-reads no other key. It sends a request again, unchanged, when the network or the server
-fails (no connection, no whole answer in time, status 5xx). The server must answer it as
-it would have the first time.
+The control is one JSON number for each image, or a list of `k` for each, positions
+too; the client reads no other key. It sends a request again, unchanged, when the
+network or the server fails (no connection, no whole answer in time, status 5xx). The
+server must answer it as it would have the first time.
 """
 
 from __future__ import annotations
@@ -100,13 +102,20 @@ class PolicyClient:
         self._lock = threading.Lock()
         weakref.finalize(self, self._http.close)
 
-    def ask(self, image: np.ndarray, goals: Sequence[int], step: int) -> np.ndarray:
+    def ask(
+        self,
+        image: np.ndarray,
+        goals: Sequence[int],
+        step: int,
+        numbers: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Post images; repeat a request that fails on its way.
 
         Args:
             image: see the module.
             goals: (n,).
             step: number of images before this one in the drive.
+            numbers: (n, k), what the policy is told besides; None for nothing.
 
         Returns:
             (n,) or (n, k) numbers as the server gives them, float64.
@@ -120,6 +129,9 @@ class PolicyClient:
             "X-Goal": ",".join(map(str, goals)),
             "X-Step": str(step),
         }
+        if numbers is not None:
+            rows = (",".join(f"{x:.9g}" for x in row) for row in numbers)
+            headers["X-Numbers"] = ";".join(rows)
         reason, attempt, remedy = "", 0, _REMEDY
         for attempt in range(self.retries + 1):
             if attempt:

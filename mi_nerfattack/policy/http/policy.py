@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
+from mi_nerfattack.policy.action import Action
 from mi_nerfattack.policy.black_box import AbstractBlackBox
-from mi_nerfattack.policy.checks import Output, Scale
 from mi_nerfattack.policy.http.client import PolicyClient
+from mi_nerfattack.policy.inputs import IMAGE, Inputs
 from mi_nerfattack.policy.preprocess import Preprocess
 
 
@@ -17,7 +20,8 @@ class HttpPolicy(AbstractBlackBox):
         url: http or https.
         timeout_s: longest wait for a whole answer.
         retries: how often a failed request is repeated.
-        preprocess: as for `AbstractBlackBox`; control_scale and output likewise.
+        preprocess: as for `AbstractBlackBox`; action and inputs likewise. The server
+            gets the frame as it is, images of several cameras side by side.
         token: that the server wants.
     """
 
@@ -27,13 +31,18 @@ class HttpPolicy(AbstractBlackBox):
         timeout_s: float = 10.0,
         retries: int = 2,
         preprocess: Preprocess | None = None,
-        control_scale: Scale = 1.0,
-        output: Output = None,
+        action: Action | None = None,
+        inputs: Inputs | None = None,
         token: str = "",
     ) -> None:
         self.client: PolicyClient = PolicyClient(url, token, timeout_s, retries)
-        AbstractBlackBox.__init__(self, url, preprocess, control_scale, output)
+        inputs = Inputs(numbers=(inputs or Inputs()).numbers)
+        AbstractBlackBox.__init__(self, url, preprocess, action, inputs)
 
-    def answer(self, image: np.ndarray, goals: np.ndarray, step: int) -> np.ndarray:
+    def answer(
+        self, given: Mapping[str, np.ndarray], goals: np.ndarray, step: int
+    ) -> np.ndarray:
         """Ask the server."""
-        return self.client.ask(image, goals.tolist(), step)
+        told = [given[name].reshape(len(goals), -1) for name in self.numbers.columns]
+        numbers = np.hstack(told) if told else None
+        return self.client.ask(given[IMAGE], goals.tolist(), step, numbers)

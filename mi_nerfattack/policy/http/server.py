@@ -26,7 +26,7 @@ import numpy as np
 
 from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.io.network import Endpoint, HttpServer, require_token
-from mi_nerfattack.policy.base import AbstractPolicy, Memory
+from mi_nerfattack.policy.base import AbstractPolicy, Memory, Numbers
 
 MAX_REQUEST_BYTES = 1 << 26
 MAX_CLIENTS = 16  # whose memories are kept
@@ -42,6 +42,7 @@ _NPY = re.compile(
 )
 _GOALS = re.compile(r"-?[0-9]{1,9}(,-?[0-9]{1,9})*")
 _STEP = re.compile(r"[0-9]{1,9}")
+_NUMBERS = re.compile(r"[-+0-9.e]{1,24}([,;][-+0-9.e]{1,24}){0,4095}")
 
 
 class RefusedError(Exception):
@@ -111,15 +112,17 @@ class PolicyServer(HttpServer):
         images: np.ndarray,
         goals: list[int],
         step: int,
+        numbers: np.ndarray | None = None,
     ) -> list[Any]:
-        """Return the control of each image: a number, or a list of several.
+        """Return the control of each image, a number, or a list of several.
 
         Args:
             client: whose drive it is.
-            request: digest of images and goals.
+            request: digest of images, goals and numbers.
             images: (n, height, width, 3) float32 in [0, 1].
             goals: (n,).
             step: images before these in the drive.
+            numbers: (n, k) float32, what the policy is told besides; None for nothing.
         """
         began = time.perf_counter()
         with self._deciding:
@@ -128,7 +131,8 @@ class PolicyServer(HttpServer):
                 return last.controls
             before = self._memory(client, len(images), step)
             try:
-                row, after = self._policy.step(mi.TensorXf(images), goals, before)
+                told = None if numbers is None else mi.TensorXf(numbers)
+                row, after = self._policy.step(mi.TensorXf(images), goals, before, told)
                 controls = np.array(row, np.float64).T
             except InputError as err:
                 raise RefusedError(422, str(err)) from err
@@ -164,6 +168,11 @@ class PolicyServer(HttpServer):
             409, f"step {step} of {count} images after {newest}; start with step 0"
         )
 
+    @property
+    def numbers(self) -> Numbers:
+        """What the policy is told besides images and goal."""
+        return self._policy.numbers
+
     def figures(self) -> dict[str, Any]:
         """Return how many decisions the policy made, how quickly, and who was refused.
 
@@ -194,10 +203,12 @@ class _Handler(BaseHTTPRequestHandler):
             body = self._body()
             images = _images(body)
             goals, step = self._goals(len(images)), self._step()
+            numbers = self._numbers(len(images), server.numbers.size)
             client = str(self.headers.get("X-Client", ""))[:64]
             # of the bytes that came: fewer than those of the images that they become
-            request = hashlib.blake2b(body + f"{goals}".encode()).digest()
-            controls = server.decide(client, request, images, goals, step)
+            told = str(self.headers.get("X-Numbers", ""))
+            request = hashlib.blake2b(body + f"{goals} {told}".encode()).digest()
+            controls = server.decide(client, request, images, goals, step, numbers)
             answer = {"control": controls}
         except RefusedError as refusal:
             self.close_connection = True  # whatever the client still sends
@@ -246,6 +257,21 @@ class _Handler(BaseHTTPRequestHandler):
         if len(goals) != count:
             raise RefusedError(400, f"X-Goal must have one integer for {count} images")
         return goals
+
+    def _numbers(self, count: int, size: int) -> np.ndarray | None:
+        """Read what the policy is told besides images, (n, k); None for nothing."""
+        text = str(self.headers.get("X-Numbers", ""))
+        if not size and not text:
+            return None
+        rows = [row.split(",") for row in text.split(";")]
+        if not _NUMBERS.fullmatch(text) or [len(row) for row in rows] != [size] * count:
+            raise RefusedError(
+                400, f"X-Numbers must have {size} numbers for each of {count} images"
+            )
+        numbers = np.array(rows, np.float32)
+        if not np.isfinite(numbers).all():
+            raise RefusedError(400, "X-Numbers has values that are not finite")
+        return numbers
 
     def _step(self) -> int:
         text = str(self.headers.get("X-Step", ""))

@@ -250,41 +250,108 @@ class Route:
         """Heading (n,) of :meth:`project`, radians in [-pi, pi]."""
         return self.project(state).heading_error
 
+    def ahead(self, state: Any, distances_m: Sequence[float]) -> list[Any]:
+        """Find points further on, as vehicles see them; differentiable in the state.
+
+        A point beyond the ends of an open route lies on the straight prolongation.
+
+        Args:
+            state: Dr.Jit array (m, n), m >= 3, metres and radians.
+            distances_m: arc lengths from the nearest point of the route, metres.
+
+        Returns:
+            Two rows (n,) a distance: metres forward and to the left of the vehicle.
+        """
+        return _ahead(self, state, distances_m)
+
+
+class _Segments:
+    """Segments in device memory, for one kernel whatever the route.
+
+    Args:
+        segments: (k, 13), of `Route.segments`.
+        real: type of a row of states, detached.
+    """
+
+    def __init__(self, segments: np.ndarray, real: Any) -> None:
+        import drjit as dr  # which the computer of a car may lack
+
+        self.integer: Any = dr.uint32_array_t(real)
+        self._real = real
+        # a list: memory from NumPy has an alignment of its own, and so its own kernels
+        self._rows = real(segments.ravel().tolist())
+        self.count: Any = dr.opaque(self.integer, len(segments))
+
+    def at(self, index: Any) -> Segment:
+        """Return the numbers of segments, (n,) each."""
+        import drjit as dr
+
+        size = len(Segment._fields)
+        start = size * self.integer(index)
+        columns = (dr.gather(self._real, self._rows, start + i) for i in range(size))
+        return Segment(*columns)
+
+    def holding(self, arc: Any) -> Segment:
+        """Return the segments in which arc lengths (n,), metres, lie; constants."""
+        import drjit as dr
+
+        arc = self._real(dr.detach(arc))
+        start = dr.ones(self.integer, dr.width(arc))
+        _, index = dr.while_loop(
+            (start, dr.zeros_like(start)),
+            lambda i, found: i < self.count,
+            lambda i, found: (i + 1, dr.select(self.at(i).arc <= arc, i, found)),
+            labels=("segment", "found"),
+            mode="symbolic",
+        )
+        return self.at(index)
+
+
+def _ahead(route: Route, state: Any, distances_m: Sequence[float]) -> list[Any]:
+    """Find points of the route, as `Route.ahead` does."""
+    import drjit as dr
+
+    real: Any = dr.detached_t(type(state[0]))
+    segments, arc = _Segments(route.segments, real), route.arc_length(state)
+    sin, cos = dr.sincos(state[2])
+    lap = dr.opaque(real, route.length)
+    rows = []
+    for distance in distances_m:
+        s = arc + dr.opaque(real, distance)
+        if route.closed:
+            s = s - lap * dr.floor(dr.detach(s) / lap)
+        at = segments.holding(s)
+        along = s - at.arc
+        dx = at.x + along * at.tangent_x - state[0]
+        dy = at.y + along * at.tangent_y - state[1]
+        rows += [cos * dx + sin * dy, cos * dy - sin * dx]
+    return rows
+
 
 def _project(segments: np.ndarray, state: Any) -> Measures:
     """Find the nearest point of the segments, as `Route.project` does."""
-    import drjit as dr  # which the computer of a car may lack
+    import drjit as dr
 
     drjit = Operations(dr.select, dr.sqrt, dr.sin, dr.cos, dr.atan2, dr.detach)
     real: Any = dr.detached_t(type(state[0]))
-    integer: Any = dr.uint32_array_t(real)
-    # a list: memory from NumPy has an alignment of its own, and so its own kernels
-    rows = real(segments.ravel().tolist())
-    count = dr.opaque(integer, len(segments))
-
-    def segment(index: Any) -> Segment:
-        size = len(Segment._fields)
-        start = size * integer(index)
-        return Segment(*(dr.gather(real, rows, start + i) for i in range(size)))
-
-    detached = dr.detach(state)
+    stored, detached = _Segments(segments, real), dr.detach(state)
     px, py = real(detached[0]), real(detached[1])
 
     def measure_one(i: Any, best: Any, shortest: Any) -> tuple[Any, Any, Any]:
-        square = square_distance(drjit, segment(i), px, py)
+        square = square_distance(drjit, stored.at(i), px, py)
         closer = square < shortest
         return i + 1, dr.select(closer, i, best), dr.select(closer, square, shortest)
 
     # the first of the nearest segments of each vehicle
-    start = dr.zeros(integer, dr.width(px))
+    start = dr.zeros(stored.integer, dr.width(px))
     _, nearest, _ = dr.while_loop(
         (start, dr.zeros_like(start), dr.full(real, dr.inf, dr.width(px))),
-        lambda i, best, shortest: i < count,
+        lambda i, best, shortest: i < stored.count,
         measure_one,
         labels=("segment", "nearest", "square_distance"),
         mode="symbolic",
     )
-    return measure(drjit, segment(nearest), state[0], state[1], state[2])
+    return measure(drjit, stored.at(nearest), state[0], state[1], state[2])
 
 
 def smooth_absolute(error: Any, width: float = 0.05) -> Any:

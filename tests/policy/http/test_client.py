@@ -12,6 +12,7 @@ import pytest
 from support.files.policies import camera
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.policy.action import Action
 from mi_nerfattack.policy.http.policy import HttpPolicy
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -39,7 +40,7 @@ GOOD = (200, b'{"control": [0.5, -0.25]}')
 def test_http_protocol_and_retries(served, rng, monkeypatch):
     monkeypatch.setattr("mi_nerfattack.policy.http.client.PAUSE_S", 0.01)
     made, seen = handler((503, b""), GOOD, (502, b""), GOOD)
-    policy = HttpPolicy(served(made), retries=1, control_scale=2.0)
+    policy = HttpPolicy(served(made), retries=1, action=Action(scale=2.0))
     image, memory = camera(2, rng), policy.initial_memory(2)
     for step in range(2):
         control, memory = policy.step(image, [0, 2], memory)

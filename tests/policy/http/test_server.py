@@ -17,6 +17,7 @@ from torch import nn
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io.network import Endpoint, read_token
+from mi_nerfattack.policy.action import Action
 from mi_nerfattack.policy.http import server as http_server
 from mi_nerfattack.policy.http.client import PolicyClient
 from mi_nerfattack.policy.http.policy import HttpPolicy
@@ -95,10 +96,11 @@ class Both(nn.Module):
 def test_several_controls_of_each_image_are_a_list():
     """Served by one policy, and asked for by another that swaps them."""
     images = np.concatenate([grey(0.25), grey(0.5)])
-    with serving(TorchPolicy(Both(), output=(0, 1))) as (_, url):
+    with serving(TorchPolicy(Both(), action=Action((0, 1)))) as (_, url):
         answer = PolicyClient(url, TOKEN).ask(images, [0, 0], 0)
         np.testing.assert_allclose(answer, [[0.25, -0.5], [0.5, -1.0]])
-        policy = HttpPolicy(url, output=(1, 0), control_scale=(1.0, 2.0), token=TOKEN)
+        action = Action((1, 0), (1.0, 2.0))
+        policy = HttpPolicy(url, action=action, token=TOKEN)
         rows = policy.control(mi.TensorXf(images.transpose(0, 2, 3, 1)), 0)
         np.testing.assert_allclose(rows, [[-0.5, -1.0], [0.5, 1.0]])
 
@@ -166,7 +168,7 @@ test_other_computers_need_a_token = refusals(
 
 
 def test_what_the_policy_says_of_an_image():
-    broken = TorchPolicy(Sum(), recurrent=[(-1, 1)], control_scale=float("inf"))
+    broken = TorchPolicy(Sum(), recurrent=[(-1, 1)], action=Action(scale=float("inf")))
     with serving() as (_, url), serving(broken) as (_, other):
         client = PolicyClient(url, TOKEN, retries=0)
         with pytest.raises(InputError, match="status 422 .*too bright by"):

@@ -14,7 +14,7 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 
 from mi_nerfattack.policy.onnx.network import OnnxNetwork
-from mi_nerfattack.scenario.policy import load_policy
+from mi_nerfattack.scenario.policy.kinds import load_policy
 
 
 def policy_of(folder, **keys):

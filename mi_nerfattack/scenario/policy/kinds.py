@@ -5,44 +5,37 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, MutableMapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.io.network import read_token
-from mi_nerfattack.policy.base import AbstractPolicy
+from mi_nerfattack.policy.action import Action
+from mi_nerfattack.policy.base import AbstractPolicy, Numbers
 from mi_nerfattack.policy.black_box import DIFFERENTIABLE_KINDS, CallablePolicy
 from mi_nerfattack.policy.drjit_network import DrJitNetwork
 from mi_nerfattack.policy.exported import load_exported, load_torchscript
-from mi_nerfattack.policy.goals import (
+from mi_nerfattack.policy.http.policy import HttpPolicy
+from mi_nerfattack.policy.inputs import (
+    Inputs,
     IntegerGoal,
     NoGoal,
     OneHotGoal,
     declared_goal,
 )
-from mi_nerfattack.policy.http.policy import HttpPolicy
 from mi_nerfattack.policy.one_image import OneImage
 from mi_nerfattack.policy.pilotnet import PilotNet, stored_unit
-from mi_nerfattack.policy.preprocess import (
-    FILTERS,
-    LAYOUTS,
-    AbstractTransform,
-    Crop,
-    FractionalCrop,
-    Normalise,
-    Preprocess,
-    Resize,
-    ToLinear,
-    to_bgr,
-    to_grey,
-    to_yuv,
-)
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.policy.weights import load_drjit_state, load_state
-from mi_nerfattack.ranges import Count, Finite, Positive, Whole
+from mi_nerfattack.ranges import Positive, Whole
 from mi_nerfattack.scenario.named_file import Code, File
+from mi_nerfattack.scenario.policy.parts import (
+    NonZero,
+    PreprocessSection,
+    TrajectorySection,
+)
 from mi_nerfattack.scenario.section import (
     Kinds,
     OneOrSeveral,
@@ -54,12 +47,6 @@ from mi_nerfattack.scenario.section import (
 )
 from mi_nerfattack.scenario.user_code import check_trust
 
-COLOURS: dict[str, Callable[[], AbstractTransform]] = {
-    "linear": ToLinear,
-    "yuv": to_yuv,
-    "grey": to_grey,
-    "bgr": to_bgr,
-}
 #: Kinds by the suffix of the file.
 SUFFIXES = {
     ".safetensors": "pilotnet",
@@ -70,62 +57,29 @@ SUFFIXES = {
 }
 
 
-def _not_zero(value: float) -> float:
-    if value == 0:
-        raise ValueError("must not be 0")
-    return value
-
-
-Part = Annotated[float, Field(ge=0, lt=1)]
-NonZero = Annotated[Finite, AfterValidator(_not_zero)]
 Shapes = tuple[tuple[int, ...], ...]
-
-
-class PreprocessSection(Section):
-    """From the camera's image to the policy's input, in the order of the keys."""
-
-    crop_px: tuple[Whole, Whole, Whole, Whole] | None = None  # see crop_fraction
-    crop_fraction: tuple[Part, Part, Part, Part] | None = None  # top bottom left right
-    resize_px: tuple[Count, Count] | None = None  # width, height
-    filter: Literal["antialias", "bilinear", "area"] = "antialias"
-    colour: Literal["srgb", "linear", "yuv", "grey", "bgr"] = "srgb"
-    scale: Positive = 1.0  # of values in [0, 1]
-    mean: Annotated[tuple[Finite, ...], Field(min_length=1)] = (0.0,)
-    std: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1.0,)
-    frames: Count = 1  # in the stack
-    stride: Count = 1  # control periods between them
-    layout: Literal["NCHW", "NHWC", "NTCHW", "NTHWC"] = "NCHW"
-
-    @model_validator(mode="after")
-    def _check_crops(self) -> Any:
-        if self.crop_px is not None and self.crop_fraction is not None:
-            refuse("crop_fraction", "stands beside crop_px; give one of them")
-        return self
-
-    def build(self) -> Preprocess:
-        """Make the transforms, in the order of the keys."""
-        transforms: list[AbstractTransform] = []
-        if self.crop_px is not None:
-            transforms.append(Crop(*self.crop_px))
-        if self.crop_fraction is not None:
-            transforms.append(FractionalCrop(*self.crop_fraction))
-        if self.resize_px is not None:
-            transforms.append(Resize(*self.resize_px, FILTERS[self.filter]))
-        if self.colour != "srgb":
-            transforms.append(COLOURS[self.colour]())
-        if (self.scale, self.mean, self.std) != (1.0, (0.0,), (1.0,)):
-            transforms.append(Normalise(self.scale, self.mean, self.std))
-        return Preprocess(transforms, self.frames, self.stride, LAYOUTS[self.layout])
+Views = Mapping[str, tuple[slice, slice]]
+NO_VIEWS: Views = {}
 
 
 class AbstractPolicySection(Section):
     """What describes every policy."""
 
-    control_scale: OneOrSeveral[NonZero] = 1.0  # to rad/s or rad, positive to the left
-    control_unit: Annotated[Unit | None, Field(exclude=True)] = None  # after scale
-    output: OneOrSeveral[Whole] | None = None  # column or columns of the control
+    #: To rad/s (dubins) or rad, positive to the left; of several controls one each.
+    control_scale: OneOrSeveral[NonZero] = 1.0
+    #: After `control_scale`; results do not depend on this key.
+    control_unit: Annotated[Unit | None, Field(exclude=True)] = None
+    #: Column of the control, where there are several; or columns of several.
+    output: OneOrSeveral[Whole] | None = None
+    #: What the policy is given, in its order: image or names of cameras, speed, route,
+    #: time, goal; by default images and goal.
+    inputs: tuple[str, ...] = ()
+    route_m: tuple[Positive, ...] = ()  # of the points of "route"
+    trajectory: TrajectorySection | None = None
     preprocess: PreprocessSection = PreprocessSection()
     trust_code: Trust = False  # of files that are code: they run with all rights
+
+    later: ClassVar[tuple[str, ...]] = ("inputs", "route_m", "trajectory")
 
     @property
     def source(self) -> str:
@@ -133,17 +87,53 @@ class AbstractPolicySection(Section):
         return next(str(v) for (key, *_), v in self.leaves() if key in ("file", "url"))
 
     def unit(self) -> str | None:
-        """Return the unit of the control; None where nothing says it."""
-        return self.control_unit
+        """Return the unit of the first control; None where nothing says it."""
+        return self.control_unit if self.trajectory is None else self.trajectory.unit
 
     @abstractmethod
-    def build(self) -> AbstractPolicy:
+    def build(self, views: Views = NO_VIEWS) -> AbstractPolicy:
         """Make the policy.
+
+        Args:
+            views: rows and columns of each camera's image in the frame, by its name;
+                by default the frame is the only image.
 
         Raises:
             InputError: a file is missing or wrong, or is code without the word of
                 trust, or a package that the kind needs is not installed.
         """
+
+    def action(self) -> Action:
+        """Return what the policy's answer means."""
+        follower = None if self.trajectory is None else self.trajectory.build()
+        return Action(self.columns, self.control_scale, follower)
+
+    @property
+    def columns(self) -> int | tuple[int, ...] | None:
+        """Columns of the controls in the answer."""
+        return self.output
+
+    def given(self, views: Views) -> Inputs:
+        """Return what the policy is given; `views` as of :meth:`build`."""
+        speed = "speed" in self.inputs or self.trajectory is not None
+        numbers = Numbers(speed, self.route_m, "time" in self.inputs)
+        return Inputs(self.inputs, numbers, views)
+
+    @model_validator(mode="after")
+    def _check_parts(self) -> Any:
+        """Refuse points that are not told, or told without distances."""
+        if ("route" in self.inputs) != bool(self.route_m):
+            refuse(
+                "route_m",
+                'arc lengths to points ahead, metres, go with "route" among inputs',
+            )
+        if self.trajectory is not None and self.control_unit is not None:
+            refuse("control_unit", "trajectory.controls says it; leave it out")
+        try:
+            self.action()
+        except InputError as error:
+            refuse("output", str(error))
+        return self
 
 
 class AbstractNetworkSection(AbstractPolicySection):
@@ -156,6 +146,7 @@ class AbstractNetworkSection(AbstractPolicySection):
     def _policy(
         self,
         module: torch.nn.Module,
+        views: Views,
         batch: int | None = None,
         recurrent: Shapes = (),
     ) -> TorchPolicy:
@@ -170,8 +161,8 @@ class AbstractNetworkSection(AbstractPolicySection):
             declared_goal(module) if self.goal is None else self.goal,
             self.preprocess.build(),
             recurrent,
-            self.control_scale,
-            self.output,
+            self.action(),
+            self.given(views),
             self.source,
         )
 
@@ -216,9 +207,9 @@ class PilotNetSection(AbstractNetworkSection):
             refuse("control_unit", f"{self.source} says it in its file; leave it out")
         return self
 
-    def build(self) -> AbstractPolicy:
+    def build(self, views: Views = NO_VIEWS) -> AbstractPolicy:
         """Load the network."""
-        return self._policy(PilotNet.load(self.file.file))
+        return self._policy(PilotNet.load(self.file.file), views)
 
 
 class ModuleSection(AbstractNetworkSection):
@@ -229,14 +220,14 @@ class ModuleSection(AbstractNetworkSection):
     weights_file: File | None = None  # .safetensors, or a state dict .pt
     recurrent: Shapes = ()  # -1 for the vehicles
 
-    def build(self) -> AbstractPolicy:
+    def build(self, views: Views = NO_VIEWS) -> AbstractPolicy:
         """Run the file and load the weights; refuse those that are drawn at random."""
         module = self._made(torch.nn.Module, "torch.nn.Module")
         if self.weights_file is not None:
             load_state(module, self.weights_file.file)
         else:
             self._refuse_drawn(module)
-        return self._policy(module, recurrent=self.recurrent)
+        return self._policy(module, views, recurrent=self.recurrent)
 
     def _refuse_drawn(self, module: torch.nn.Module) -> None:
         """Make the module once more, from other random numbers, and compare."""
@@ -257,7 +248,22 @@ class ProgramSection(AbstractNetworkSection):
 
     kind: Literal["exported", "torchscript", "onnx"]
     recurrent: Shapes = ()
-    output_name: str | None = None  # of the control, in an ONNX file with several
+    #: Of the control, in an ONNX file with several; or names of several controls.
+    output_name: OneOrSeveral[str] | None = None
+
+    @property
+    def _names(self) -> tuple[str, ...]:
+        """Names of the outputs that are controls."""
+        name = self.output_name or ()
+        return name if isinstance(name, tuple) else (name,)
+
+    @property
+    def columns(self) -> int | tuple[int, ...] | None:
+        """Columns of the controls; several outputs with names are columns."""
+        several = len(self._names)
+        if several > 1 and self.output is None:
+            return tuple(range(several))
+        return self.output
 
     @model_validator(mode="after")
     def _check_output_name(self) -> Any:
@@ -265,7 +271,7 @@ class ProgramSection(AbstractNetworkSection):
             refuse("output_name", "is of ONNX files alone; leave it out")
         return self
 
-    def build(self) -> AbstractPolicy:
+    def build(self, views: Views = NO_VIEWS) -> AbstractPolicy:
         """Load the program."""
         path, batch = self.file.file, None
         if self.kind != "onnx":
@@ -277,9 +283,9 @@ class ProgramSection(AbstractNetworkSection):
             batch = network.batch
         else:
             network = _load_onnx(path)
-            network.choose(self.output_name, len(self.recurrent))
+            network.choose(self._names, len(self.recurrent))
             batch = network.batch
-        return self._policy(network, batch, self.recurrent)
+        return self._policy(network, views, batch, self.recurrent)
 
 
 class DrJitSection(AbstractNetworkSection):
@@ -289,12 +295,12 @@ class DrJitSection(AbstractNetworkSection):
     file: Code
     weights_file: File | None = None  # .safetensors
 
-    def build(self) -> AbstractPolicy:
+    def build(self, views: Views = NO_VIEWS) -> AbstractPolicy:
         """Run the file and load the weights."""
         network = self._made(Callable, "drjit.nn module or a function")
         if self.weights_file is not None:
             load_drjit_state(network, self.weights_file.file)
-        return self._policy(DrJitNetwork(network))
+        return self._policy(DrJitNetwork(network), views)
 
 
 class CallableSection(AbstractPolicySection):
@@ -303,11 +309,11 @@ class CallableSection(AbstractPolicySection):
     kind: Literal["callable"]
     file: Code
 
-    def build(self) -> AbstractPolicy:
+    def build(self, views: Views = NO_VIEWS) -> AbstractPolicy:
         """Load the function."""
-        preprocess, scale = self.preprocess.build(), self.control_scale
+        preprocess, given = self.preprocess.build(), self.given(views)
         function = self.file.load("policy.file", self.trust_code)
-        return CallablePolicy(function, self.source, preprocess, scale, self.output)
+        return CallablePolicy(function, self.source, preprocess, self.action(), given)
 
 
 class HttpSection(AbstractPolicySection):
@@ -319,15 +325,15 @@ class HttpSection(AbstractPolicySection):
     retries: Whole = 2
     token_file: Annotated[File | None, Field(exclude=True)] = None  # no result's
 
-    def build(self) -> AbstractPolicy:
+    def build(self, views: Views = NO_VIEWS) -> AbstractPolicy:
         """Make the client."""
         return HttpPolicy(
             self.url,
             self.timeout_s,
             self.retries,
             self.preprocess.build(),
-            self.control_scale,
-            self.output,
+            self.action(),
+            self.given(views),
             "" if self.token_file is None else read_token(self.token_file.file),
         )
 
@@ -379,13 +385,15 @@ def load_policy(keys: Mapping[str, Any], folder: str | Path = ".") -> AbstractPo
     return read_section("policy", PolicySection, dict(keys), folder).build()
 
 
-def build_differentiable(section: AbstractPolicySection) -> AbstractPolicy:
-    """Make a policy for a gradient method.
+def build_differentiable(
+    section: AbstractPolicySection, views: Views = NO_VIEWS
+) -> AbstractPolicy:
+    """Make a policy for a gradient method; `views` as of `AbstractPolicySection.build`.
 
     Raises:
         InputError: see `AbstractPolicySection.build`, or the policy is a black box.
     """
-    policy = section.build()
+    policy = section.build(views)
     if not policy.differentiable:
         raise InputError(
             f"policy: {section.source}: is a black box, which has no derivatives; a "

@@ -1,0 +1,1 @@
+"""The section `[policy]`: kinds of policies, and what is common to them."""
