@@ -39,7 +39,7 @@ MOUNT = CameraMount()
 PERIOD_S = 0.05
 START = (-22.0, -1.45, 0.0)  # x and y in metres, heading in radians
 LANE_Y_M = -1.75  # of the lane's centre
-CAR = Dubins(speed_ms=0.35, max_heading_rate=1.5)
+CAR = Dubins(speed=0.35, max_heading_rate=1.5)
 
 DARK = 0.35  # sRGB value below which a pixel is dark
 SHARPNESS = 20.0  # of the step between dark and bright

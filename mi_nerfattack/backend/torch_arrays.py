@@ -39,11 +39,6 @@ def to_controls(value: torch.Tensor, like: Any) -> Any:
     return rows(*(to_row(column, like) for column in value.unbind(1)))
 
 
-def from_controls(controls: Any) -> torch.Tensor:
-    """Return controls (n,) as they are, and (k, n) as columns (n, k), detached."""
-    return to_torch(controls).T if dr.depth_v(controls) == 2 else to_torch(controls)
-
-
 def _settled(value: torch.Tensor, like: Any) -> Any:
     """Bring a result into the scalar type of `like` and wait for its device."""
     scalar = torch.float64 if dr.type_v(like) == dr.VarType.Float64 else torch.float32

@@ -79,6 +79,11 @@ class Car:
     max_control: Positive = 1.5
     more_controls: tuple[Control, ...] = ()
 
+    @property
+    def control_names(self) -> tuple[str, ...]:
+        """Names of the controls, in their order."""
+        return control_names(self.control_unit, self.more_controls)
+
     def __post_init__(self) -> None:
         if self.control_unit == "rad" and self.max_control > self.max_steer:
             raise InputError(

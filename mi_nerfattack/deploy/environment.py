@@ -328,6 +328,21 @@ def drive(
     )
 
 
+def single_control(row: Any, names: Sequence[str]) -> float | np.ndarray:
+    """Return what a policy gave for one image: a number, or (k,) of k > 1 controls.
+
+    Args:
+        row: (1,) or (k, 1), of Dr.Jit.
+        names: of the controls that the vehicle takes.
+
+    Raises:
+        InputError: there are not as many.
+    """
+    values = np.array(row, np.float64).reshape(-1)
+    require_controls(len(values), names)
+    return float(values[0]) if len(values) == 1 else values
+
+
 def told(
     policy: AbstractPolicy, environment: AbstractEnvironment, route: Route, step: int
 ) -> Any:
@@ -349,21 +364,6 @@ def told(
         row = to_state(np.full((1, 3), environment.speed))[0]  # opaque
     time = step * environment.period
     return stacked(numbers_of(policy.numbers, state, row, time, route))
-
-
-def single_control(row: Any, names: Sequence[str]) -> float | np.ndarray:
-    """Return what a policy gave for one image: a number, or (k,) of k > 1 controls.
-
-    Args:
-        row: (1,) or (k, 1), of Dr.Jit.
-        names: of the controls that the vehicle takes.
-
-    Raises:
-        InputError: there are not as many.
-    """
-    values = np.array(row, np.float64).reshape(-1)
-    require_controls(len(values), names)
-    return float(values[0]) if len(values) == 1 else values
 
 
 def policy_image(image: np.ndarray) -> mi.TensorXf:

@@ -168,9 +168,9 @@ class KinematicVehicle(AbstractVehicle):
         """Put the vehicle somewhere; `seed` has no effect on it."""
         del seed
         motion = self.motion
-        key = speed if "speed_ms" in motion.dynamics.__dataclass_fields__ else None
+        key = speed if "speed" in motion.dynamics.__dataclass_fields__ else None
         if key not in self._transitions:
-            changed = {} if key is None else {"speed_ms": key}
+            changed = {} if key is None else {"speed": key}
             self._transitions[key] = Transition(
                 replace(motion.dynamics, **changed),
                 motion.integrator,

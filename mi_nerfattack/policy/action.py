@@ -172,6 +172,13 @@ class Action:
             )
 
     @property
+    def count(self) -> int:
+        """Number of controls."""
+        if self.trajectory is not None:
+            return len(self.trajectory.controls)
+        return len(self.output) if isinstance(self.output, tuple) else 1
+
+    @property
     def needs_speed(self) -> bool:
         """Whether controls depend on the speed."""
         return self.trajectory is not None

@@ -9,12 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mi_nerfattack.backend.torch_arrays import (
-    from_controls,
-    to_controls,
-    to_tensor,
-    to_torch,
-)
+from mi_nerfattack.backend.torch_arrays import to_controls, to_tensor, to_torch
 from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.policy.action import Action
 from mi_nerfattack.policy.base import AbstractPolicy, Memory, Numbers
@@ -222,7 +217,8 @@ class TorchPolicy(AbstractPolicy):
             control, after = self._evaluate(
                 leaves[0], goal, tuple(leaves[1:end]), *leaves[end:]
             )
-        weight = from_controls(cotangent).to(control)
+        weight = to_torch(cotangent).to(control)
+        weight = weight if weight.ndim == 1 else weight.T
         if weight.shape != control.shape:
             raise InputError(
                 f"cotangent: {tuple(weight.shape)} for {tuple(control.shape)} controls"

@@ -17,7 +17,6 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
-from mi_nerfattack.deploy.car import control_names
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.io.overrides import set_keys, tell
@@ -42,6 +41,7 @@ from mi_nerfattack.scenario.section import (
     CameraSection,
     NamedCameraSection,
     Section,
+    check_count,
     misfit,
     problems,
     refuse,
@@ -252,25 +252,16 @@ class Scenario(Section):
             )
         if model == "custom":
             for label, section in sections:
-                kind = section.kind
-                if kind.startswith("mujoco"):
+                if section.kind.startswith("mujoco"):
                     refuse(
                         "deployment",
-                        f"{label}: {kind} drives a car with wheels, whose control is "
-                        "not that of a custom vehicle; take mitsuba",
+                        f"{label}: {section.kind} drives a car with wheels, whose "
+                        "control is not that of a custom vehicle; take mitsuba",
                     )
         policy, taken = self.policy, self.vehicle.unit
         if reason := misfit(policy.unit(), taken, policy.source):
             refuse("vehicle.kind", f"{model} {reason}")
-        car, output = self.vehicle.car(), policy.output
-        given = len(output) if isinstance(output, tuple) else 1
-        names = control_names(car.control_unit, car.more_controls)
-        if given != len(names):
-            refuse(
-                "policy.output",
-                f"says {given} of the policy's numbers; the vehicle takes {len(names)}:"
-                f" {', '.join(names)}; give a column for each",
-            )
+        check_count(policy.action().count, self.vehicle.car().control_names)
         return self
 
     def _check_cameras(self) -> None:

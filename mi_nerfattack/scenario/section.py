@@ -298,6 +298,21 @@ def misfit(given: str | None, taken: str | None, source: str) -> str:
     )
 
 
+def check_count(given: int, names: Sequence[str]) -> None:
+    """Refuse a policy that gives more or fewer controls than its vehicle takes.
+
+    Args:
+        given: number of the policy's.
+        names: of the vehicle's.
+    """
+    if given != len(names):
+        refuse(
+            "policy.output",
+            f"the policy gives {given}, the vehicle takes {len(names)}: "
+            f"{', '.join(names)}; give a column for each",
+        )
+
+
 class AbstractCameraSection(Section):
     """A camera on the vehicle."""
 

@@ -247,7 +247,7 @@ def driven_route(scenario: Scenario, motion: Motion) -> Route:
 
 def at_own_speed(route: Route, motion: Motion) -> Route:
     """Return a route with the vehicle's speed, where that is its own."""
-    speed = getattr(motion.dynamics, "speed_ms", route.speed_ms)
+    speed = getattr(motion.dynamics, "speed", route.speed_ms)
     return replace(route, speed_ms=speed)
 
 

@@ -339,7 +339,7 @@ def check_site(site: AbstractSite) -> None:
     if site.rig.size != (width, height):
         wide, high = site.rig.size
         raise InputError(
-            f"camera of {site.name!r}: {wide} x {high} px; PilotNet takes {width} x "
-            f"{height}: change the camera, or collect frames alone ('mi-nerfattack "
-            "train --frames-only') and train your own network"
+            f"camera of {site.name!r}: {wide} x {high} px; PilotNet "
+            f"takes {width} x {height}: change the camera, or collect frames alone "
+            "('mi-nerfattack train --frames-only') and train your own network"
         )

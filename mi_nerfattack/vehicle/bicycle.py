@@ -26,13 +26,13 @@ class KinematicBicycle(AbstractDynamics):
     radius of `hypot(r, (f + r) / tan u)`. Source: Polack et al. 2017, section II.
 
     Args:
-        speed_ms: v, metres per second, of the centre of gravity.
+        speed: v, metres per second, of the centre of gravity.
         front_m: f, distance from the centre of gravity to the front axle, metres.
         rear_m: r, the same to the rear axle.
         max_steer: limit of ``|u|``, radians, below pi/2.
     """
 
-    speed_ms: Positive = 5.0
+    speed: Positive = 5.0
     front_m: Positive = 1.35
     rear_m: Positive = 1.35
     max_steer: Acute = 0.6
@@ -42,7 +42,7 @@ class KinematicBicycle(AbstractDynamics):
     def derivative(self, state: Any, control: Any) -> Any:
         """Compute (3, n) from state (3, n) and steering angle (n,) in radians."""
         tangent = self.rear_m / (self.front_m + self.rear_m) * dr.tan(control)
-        along = self.speed_ms / dr.sqrt(1 + dr.square(tangent))  # v cos(beta)
+        along = self.speed / dr.sqrt(1 + dr.square(tangent))  # v cos(beta)
         across = along * tangent  # v sin(beta)
         sin, cos = dr.sincos(state[2])
         return type(state)(
@@ -71,14 +71,14 @@ class RateLimitedAckermann(AbstractDynamics):
     2.7 tau.
 
     Args:
-        speed_ms: v, metres per second, of the rear axle.
+        speed: v, metres per second, of the rear axle.
         wheelbase: l, metres.
         max_steer: limit of ``|u|``, radians, below pi/2.
         max_steer_rate: limit of ``|d delta/dt|``, radians per second.
         time_constant: tau, seconds.
     """
 
-    speed_ms: Positive = 5.0
+    speed: Positive = 5.0
     wheelbase: Positive = 2.7
     max_steer: Acute = 0.6
     max_steer_rate: Positive = 0.7
@@ -94,10 +94,10 @@ class RateLimitedAckermann(AbstractDynamics):
     def derivative(self, state: Any, control: Any) -> Any:
         """Compute (4, n) from state (4, n) and commanded angle (n,) in radians."""
         sin, cos = dr.sincos(state[2])
-        heading_rate = self.speed_ms / self.wheelbase * dr.tan(state[3])
+        heading_rate = self.speed / self.wheelbase * dr.tan(state[3])
         wanted = (control - state[3]) / self.time_constant
         steer_rate = soft_limit(wanted, self.max_steer_rate)
-        along = self.speed_ms * cos, self.speed_ms * sin
+        along = self.speed * cos, self.speed * sin
         return type(state)(*along, heading_rate, steer_rate)
 
     def saturate(self, control: Any) -> Any:

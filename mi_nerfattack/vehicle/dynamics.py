@@ -192,21 +192,6 @@ class AbstractDynamics(ABC):
             (m, n), metres per second and radians per second.
         """
 
-    def speed_of(self, state: Any) -> Any:
-        """Return the speeds (n,) along the heading, m/s, negative in reverse.
-
-        By default those of `derivative` without a control; differentiable.
-
-        Args:
-            state: (m, n), metres and radians.
-        """
-        row = dr.zeros(dr.detached_t(type(state[0])), dr.width(state))
-        several = self.control_size > 1
-        control = _rows_t(type(row))(*[row] * self.control_size) if several else row
-        slope = self.derivative(state, control)
-        sin, cos = dr.sincos(state[2])
-        return cos * slope[0] + sin * slope[1]
-
     def jacobian(self, state: Any, control: Any) -> list[Any]:
         """Compute df/dx by forward-mode differentiation.
 
@@ -242,6 +227,17 @@ class AbstractDynamics(ABC):
             of the same shape.
         """
 
+    def speed_of(self, state: Any) -> Any:
+        """Return speeds (n,) along the headings of states (m, n), m/s; signed.
+
+        Differentiable; with the control 0, which moves no vehicle at once.
+        """
+        none, size = dr.zeros(type(state[0]), dr.width(state)), self.control_size
+        control = none if size == 1 else _rows_t(type(none))(*[none] * size)
+        slope = self.derivative(state, control)
+        sin, cos = dr.sincos(state[2])
+        return slope[0] * cos + slope[1] * sin
+
     def numbered(self, first: int) -> AbstractDynamics:
         """Return this model with another number of the first drive of each batch.
 
@@ -271,11 +267,11 @@ class Dubins(AbstractDynamics):
     `dx/dt = (v cos theta, v sin theta, u)`. Source: appendix A.7.
 
     Args:
-        speed_ms: v, metres per second.
+        speed: v, metres per second.
         max_heading_rate: limit of ``|u|``, radians per second.
     """
 
-    speed_ms: Positive = 5.0
+    speed: Positive = 5.0
     max_heading_rate: Positive = 1.5
 
     control_names: ClassVar[tuple[str, ...]] = ("heading_rate",)
@@ -283,7 +279,7 @@ class Dubins(AbstractDynamics):
     def derivative(self, state: Any, control: Any) -> Any:
         """Compute (3, n) from state (3, n) and heading rate (n,) in rad/s."""
         sin, cos = dr.sincos(state[2])
-        return type(state)(self.speed_ms * cos, self.speed_ms * sin, control)
+        return type(state)(self.speed * cos, self.speed * sin, control)
 
     def saturate(self, control: Any) -> Any:
         """Limit the heading rate (n,) with `soft_limit`."""
@@ -300,12 +296,12 @@ class Ackermann(AbstractDynamics):
     equation has that of the heading.
 
     Args:
-        speed_ms: v, metres per second.
+        speed: v, metres per second.
         wheelbase: l, metres.
         max_steer: limit of ``|u|``, radians, below pi/2.
     """
 
-    speed_ms: Positive = 5.0
+    speed: Positive = 5.0
     wheelbase: Positive = 2.7
     max_steer: Acute = 0.6
 
@@ -314,8 +310,8 @@ class Ackermann(AbstractDynamics):
     def derivative(self, state: Any, control: Any) -> Any:
         """Compute (3, n) from state (3, n) and steering angle (n,) in radians."""
         sin, cos = dr.sincos(state[2])
-        heading_rate = self.speed_ms / self.wheelbase * dr.tan(control)
-        return type(state)(self.speed_ms * cos, self.speed_ms * sin, heading_rate)
+        heading_rate = self.speed / self.wheelbase * dr.tan(control)
+        return type(state)(self.speed * cos, self.speed * sin, heading_rate)
 
     def saturate(self, control: Any) -> Any:
         """Limit the steering angle (n,) with `soft_limit`."""

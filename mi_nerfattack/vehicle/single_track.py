@@ -48,7 +48,7 @@ class AbstractSingleTrack(AbstractDynamics):
     """What both models have: their two controls, and the limits of these.
 
     Args:
-        speed_ms: v of the first state, m/s.
+        speed: v of the first state, m/s.
         max_steer: limit of the steering angle, radians, below pi/2.
         max_acceleration: largest acceleration, m/s^2.
         max_brake: largest deceleration, m/s^2.
@@ -56,7 +56,7 @@ class AbstractSingleTrack(AbstractDynamics):
             than ``2 stop_speed / max_brake`` makes the car swing about rest.
     """
 
-    speed_ms: Positive = 5.0
+    speed: Positive = 5.0
     max_steer: Acute = 0.6
     max_acceleration: Positive = 3.0
     max_brake: Positive = 8.0
@@ -71,7 +71,7 @@ class AbstractSingleTrack(AbstractDynamics):
     def extend(self, poses: np.ndarray) -> np.ndarray:
         """Append the first speed, and zeros: (n, 3) to (n, m)."""
         states = super().extend(poses)
-        states[:, 3] = self.speed_ms
+        states[:, 3] = self.speed
         return states
 
     def saturate(self, control: Any) -> Any:

@@ -20,8 +20,10 @@ from mi_nerfattack.deploy.stress.timing import LateControls
 from mi_nerfattack.deploy.vehicle import KinematicVehicle, Motion
 from mi_nerfattack.drives.table import FURTHER, STEPS, read_csv, write_steps
 from mi_nerfattack.evaluation.evaluate import ExpertPolicy
+from mi_nerfattack.policy.action import Action
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.camera.intrinsics import CameraMount
+from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.rollout.drive import Drive, Lane
 from mi_nerfattack.vehicle import DynamicSingleTrack, KinematicSingleTrack
 from mi_nerfattack.vehicle.dynamics import Dubins
@@ -40,7 +42,9 @@ def kinematic(model=None):
 
 def environment(vehicle=None):
     vehicle = vehicle or kinematic()
-    return SimulatedEnvironment("blank", vehicle, BlankView(), CameraMount(), 0.1)
+    view = BlankView()
+    rig = Rig.of_one(view.camera, CameraMount())
+    return SimulatedEnvironment("blank", vehicle, [view], rig, 0.1)
 
 
 def test_kinematic_vehicles_brake_and_accelerate():
@@ -158,7 +162,7 @@ class Two(torch.nn.Module):
 
 
 def test_policies_give_a_row_for_each_control():
-    policy = TorchPolicy(Two(), output=(0, 1))
+    policy = TorchPolicy(Two(), action=Action((0, 1)))
     driven = drive(environment(), policy, straight(), np.zeros(3), 0, 3)
     assert driven.controls.shape == (3, 2) and not driven.controls.any()
 
@@ -173,7 +177,7 @@ def wrong(control):
 
 
 def drive_one():
-    policy = TorchPolicy(Two(), output=0)
+    policy = TorchPolicy(Two(), action=Action(0))
     drive(environment(), policy, straight(), np.zeros(3), 0, 1)
 
 

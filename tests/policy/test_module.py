@@ -217,9 +217,8 @@ def test_a_module_says_how_it_takes_the_goal(line, goal, tmp_path):
 def test_several_controls_are_rows_and_go_back(rng):
     """Columns in any order, each with a scale; the derivative is autograd's."""
     weight = torch.randn(3, 3, generator=torch.Generator().manual_seed(1))
-    made = policy(
-        lambda x: x.mean((2, 3)) @ weight, output=(2, 0), control_scale=(2.0, -0.5)
-    )
+    action = Action((2, 0), (2.0, -0.5))
+    made = policy(lambda x: x.mean((2, 3)) @ weight, action=action)
     image = images(rng)
     rows = made.control(image, 0)
     means = torch.tensor(image.numpy().mean((1, 2)))
@@ -232,4 +231,4 @@ def test_several_controls_are_rows_and_go_back(rng):
     expected = np.broadcast_to(by_mean[:, None, None] / np.prod(SIZE), found.shape)
     np.testing.assert_allclose(found, expected, rtol=1e-5)
     with pytest.raises(InputError, match=r"output \(is \(3, 0\)\)"):
-        policy(lambda x: x.mean((2, 3)), output=(3, 0)).control(image, 0)
+        policy(lambda x: x.mean((2, 3)), action=Action((3, 0))).control(image, 0)

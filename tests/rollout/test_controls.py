@@ -13,6 +13,7 @@ from support.reference import loop as analytic
 from support.reference.derivatives import central_difference, nothing_compiled
 from support.worlds.loops import ADJOINTS, Wave, assert_close, flat
 
+from mi_nerfattack.policy.action import Action
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import ClosedLoop
@@ -54,7 +55,7 @@ class Remembering(TwoControls):
 def make_loop(vehicle: AbstractDynamics = ROLLING, delay=0, memory=False, objects=1):
     module = Remembering() if memory else TwoControls()
     recurrent = [(-1, 2)] if memory else []
-    policy = TorchPolicy(module, recurrent=recurrent, output=(0, 1))
+    policy = TorchPolicy(module, recurrent=recurrent, action=Action((0, 1)))
     sensor = analytic.AnalyticSensor(analytic.random_textures(objects))
     return ClosedLoop(sensor, policy, 1, vehicle, RK4(), 0.1, 4, delay, eight_bit=False)
 
@@ -172,7 +173,7 @@ test_refused = refusals(
         "gives 1, the vehicle takes 2: steering, acceleration",
     ),
     (
-        drive_with(Dubins(), TwoControls(), output=(0, 1)),
+        drive_with(Dubins(), TwoControls(), action=Action((0, 1))),
         "gives 2, the vehicle takes 1: heading_rate",
     ),
     (lambda: FunctionDynamics(user_car, limit=(1.0,), controls=2), r"limit: \(1.0,\)"),

@@ -110,7 +110,7 @@ def test_each_drive_has_its_own_vehicle(model):
     control = type(start[0])([0.3, -0.2, 0.1])
     found = np.array(vehicle.derivative(start, control))
     for k in range(3):
-        own = {"speed_ms": model.speed_ms * drawn.speed[k]}
+        own = {"speed": model.speed * drawn.speed[k]}
         if rows > 3 or isinstance(model, Ackermann):
             own["wheelbase"] = model.wheelbase / drawn.steering[k]
         expected = np.array(replace(model, **own).derivative(start, control))[:, k]
@@ -127,7 +127,7 @@ def test_a_vehicle_with_a_speed_state_is_faster_at_each_speed():
     control = to_control(np.array([[0.1, 1.0]] * 3))
     drawn = vehicle.variation.draws(0, 3)
     slope = vehicle.derivative(state, control).numpy()
-    np.testing.assert_allclose(vehicle.speed(state), 8 * drawn.speed)
+    np.testing.assert_allclose(vehicle.speed_of(state), 8 * drawn.speed)
     turn = 8 / 2.7 * np.tan(0.1) * drawn.speed * drawn.steering
     np.testing.assert_allclose(slope[2], turn)
     np.testing.assert_allclose(slope[3], 1.0)

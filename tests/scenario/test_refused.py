@@ -79,8 +79,8 @@ route = "lane" -> => :2: scene.route: is missing
   control_unit = "other"; [policy]; file = "a.pt"; control_unit = "rad"
   => vehicle.kind: custom takes other, and a.pt gives rad; .*control_scale
 [vehicle]; kind = "kinematic_single_track"; [policy]; file = "a.pt"
-  => policy.output: says 1 .*takes 2: steering, acceleration
-[policy]; file = "a.pt"; output = [0, 1] => policy.output: says 2 .*1: heading_rate
+  => policy.output: .*gives 1, .*takes 2: steering, acceleration
+[policy]; file = "a.pt"; output = [0, 1] => policy.output: .*gives 2, .*1: heading_rate
 [policy]; file = "a.pt"; output = [0, -1] => policy.output.1: .*equal to 0
 [vehicle]; delay_steps = -1 => vehicle.delay_steps: .*0
 [vehicle]; kind = "ackermann_rate"; steer_time_s = 0.03; substeps = 1

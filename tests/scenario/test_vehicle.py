@@ -164,8 +164,8 @@ def test_hard_steering_with_a_lag_stays_within_a_centimetre(keys):
     def slope(_, x):
         rate = (command - x[3]) / car.time_constant / car.max_steer_rate
         rate *= car.max_steer_rate / (1 + rate**8) ** 0.125
-        heading = car.speed_ms / car.wheelbase * np.tan(x[3])
-        along = car.speed_ms * np.array([np.cos(x[2]), np.sin(x[2])])
+        heading = car.speed / car.wheelbase * np.tan(x[3])
+        along = car.speed * np.array([np.cos(x[2]), np.sin(x[2])])
         return [*along, heading, rate]
 
     for period in range(60):

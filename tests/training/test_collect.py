@@ -32,6 +32,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
+from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.system.workers import InThisProcess
 from mi_nerfattack.training.collect import collect
 from mi_nerfattack.training.dataset import FrameDataset, find_shards
@@ -276,8 +277,9 @@ class AcceleratedSite(PaintedSite):
         car, motion = self.car, Motion(KinematicSingleTrack())
         rest = car.max_control, car.control_unit, car.more_controls
         vehicle = KinematicVehicle(motion, self.period, *rest)
-        view, mount = BlankView(), CameraMount()
-        return SimulatedEnvironment("blank", vehicle, view, mount, self.period)
+        view = BlankView()
+        rig = Rig.of_one(view.camera, CameraMount())
+        return SimulatedEnvironment("blank", vehicle, [view], rig, self.period)
 
 
 def test_frames_of_a_car_with_two_controls_have_both(tmp_path):

@@ -121,7 +121,7 @@ def test_command_of_a_standing_car_has_no_kink():
 
 
 def test_without_acceleration_it_is_ackermann():
-    model, twin = replace(ROLLING, speed_ms=4.0), Ackermann(4.0, 2.5, 0.6)
+    model, twin = replace(ROLLING, speed=4.0), Ackermann(4.0, 2.5, 0.6)
     path, x = drive(model, ([0.3], [0.0]), 1.0), state64(np.zeros((3, 1)))
     for _ in range(50):
         x = RK4().step(twin, x, twin.saturate(row64([0.3])), 0.02)
@@ -143,17 +143,17 @@ def test_steady_circle_is_that_of_the_understeer_gradient():
 
 
 def test_grip_ends_at_the_friction():
-    path = drive(replace(SLIPPING, speed_ms=20.0), ([0.5], [0.0]), 2.0, 0.005)
+    path = drive(replace(SLIPPING, speed=20.0), ([0.5], [0.0]), 2.0, 0.005)
     sideways = path[1:, 5] * path[1:, 3] + np.diff(path[:, 4]) / 0.005
     assert np.abs(sideways).max() <= 0.9 * GRAVITY * 1.001
-    rolling = drive(replace(ROLLING, speed_ms=20.0), ([0.5], [0.0]), 2.0, 0.005)
+    rolling = drive(replace(ROLLING, speed=20.0), ([0.5], [0.0]), 2.0, 0.005)
     assert abs(path[-1, 2]) < 0.2 * abs(rolling[-1, 2])
 
 
 def test_slow_tyres_roll():
     """At walking speed the path is that of the kinematic bicycle; at rest none."""
     twin = KinematicBicycle(1.0, 1.2, 1.5, 0.6)
-    path = drive(replace(SLIPPING, speed_ms=1.0), ([0.4], [0.0]), 2.0, 0.01)
+    path = drive(replace(SLIPPING, speed=1.0), ([0.4], [0.0]), 2.0, 0.01)
     turned = float(twin.derivative(state64([[0.0]] * 3), row64([0.4]))[2][0])
     assert path[-1, 5] == pytest.approx(turned * path[-1, 3], rel=0.06)
     rest = drive(SLIPPING, ([0.4], [-8.0]), 2.0, 0.01, start=[[0.0]] * 6)

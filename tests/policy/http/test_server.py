@@ -96,10 +96,11 @@ class Both(nn.Module):
 def test_several_controls_of_each_image_are_a_list():
     """Served by one policy, and asked for by another that swaps them."""
     images = np.concatenate([grey(0.25), grey(0.5)])
-    with serving(TorchPolicy(Both(), output=(0, 1))) as (_, url):
+    with serving(TorchPolicy(Both(), action=Action((0, 1)))) as (_, url):
         answer = PolicyClient(url, TOKEN).ask(images, [0, 0], 0)
         np.testing.assert_allclose(answer, [[0.25, -0.5], [0.5, -1.0]])
-        policy = HttpPolicy(url, output=(1, 0), control_scale=(1.0, 2.0), token=TOKEN)
+        action = Action((1, 0), (1.0, 2.0))
+        policy = HttpPolicy(url, action=action, token=TOKEN)
         rows = policy.control(mi.TensorXf(images.transpose(0, 2, 3, 1)), 0)
         np.testing.assert_allclose(rows, [[-0.5, -1.0], [0.5, 1.0]])
 
