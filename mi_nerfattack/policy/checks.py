@@ -79,7 +79,7 @@ def columns_of(
     if count == 1 and values.ndim < 2:  # a network that drops axes of size 1
         values = values.reshape(1, -1)
     shape = tuple(values.shape)
-    if shape != (count,):
+    if shape != (count,) or isinstance(output, Sequence):
         column = 0 if output is None and shape == (count, 1) else output
         most = max(column) if isinstance(column, Sequence) else column
         if len(shape) != 2 or shape[0] != count or most is None or most >= shape[1]:
