@@ -22,7 +22,8 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.io.strict import parse_toml
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.torch_policy import TorchPolicy
-from mi_nerfattack.scenario.policy.kinds import PolicySection, PreprocessSection
+from mi_nerfattack.scenario.policy.kinds import PolicySection
+from mi_nerfattack.scenario.policy.parts import PreprocessSection
 from mi_nerfattack.scenario.scenario import load_scenario
 
 pytestmark = pytest.mark.usefixtures("variant")
