@@ -32,6 +32,7 @@ from .policy import Preprocess as Preprocess
 from .policy import TorchPolicy as TorchPolicy
 from .render import Camera as Camera
 from .render import CameraMount as CameraMount
+from .render import Rig as Rig
 from .rollout import Checkpointed as Checkpointed
 from .rollout import ClosedLoop as ClosedLoop
 from .rollout import CVaR as CVaR

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +107,7 @@ def drive_poses(
         margin = 0.0 if route.closed else _BEYOND * width
         arc = along[i] * (route.length + 2 * margin) - margin
         state = route.pose_at(arc, lateral[i] * width, heading[i])
-        here = CameraMount(float(height[i]), mount.forward_m, float(pitch[i]))
+        here = replace(mount, height_m=float(height[i]), pitch_deg=float(pitch[i]))
         poses.append(mount_matrix(state, here)[0])
     return np.stack(poses)
 
@@ -184,7 +184,7 @@ def capture_scene(
     mount = CameraMount() if mount is None else mount
     choices = {
         "camera": to_colmap(camera)[1],
-        "mount": asdict(mount),
+        "mount": mount.described(),
         "views": n,
         "spp": spp,
         "seed": seed,

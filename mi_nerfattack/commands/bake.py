@@ -65,7 +65,8 @@ class Bake:
         options = BakeOptions(self.cone, self.passes, self.views, self.seed)
         scenario, _ = load_scenario(self.scenario, settings=self.settings)
         file, output = self._files(scenario)
-        camera, mount = scenario.camera.build()
+        rig = scenario.rig()
+        camera, mount = rig.cameras[0], rig.mounts[0]
         routes = load_routes(scenario.scene.routes.file)
         variant.ensure()
         scene = load_posed(scenario.scene, file)
@@ -101,7 +102,7 @@ class Bake:
         from mi_nerfattack.errors import InputError
         from mi_nerfattack.fit.scores import MIN_EDGE_PX
 
-        scene, camera = scenario.scene, scenario.camera
+        scene, camera = scenario.scene, scenario.rig().cameras[0]
         if scene.field is None:
             raise InputError(f"{self.scenario}: scene.field is missing; name the field")
         named = None if scene.bricks is None else scene.bricks.file

@@ -110,18 +110,21 @@ class DriveCommand:
             )
         is_here = name != EXPERT and not name.startswith(SCHEMES)
         file = PolicyFile.read(name) if is_here else None
-        camera = file and file.camera
+        rig = file and file.rig
         if config.camera_file is not None:
-            camera = read_camera(config.camera_file)
+            rig = read_camera(config.camera_file)
         policy, unit, wheelbase_m = None, "rad" if name == EXPERT else None, None
         if file is not None:
             from mi_nerfattack import variant
 
             variant.ensure()
-            policy = file.section.build()
+            policy = file.section.build(file.views)
             unit, wheelbase_m = file.control()
         config = config.driven_by(unit, wheelbase_m)
-        return config, Trained(policy, *(camera or (None, None)))
+        if rig is None:
+            return config, Trained(policy)
+        rig.require_one(f"{name}", "the car has one: take a policy of one")
+        return config, Trained(policy, rig.cameras[0], rig.mounts[0])
 
 
 def _open_rig(
@@ -191,6 +194,8 @@ def _sight(camera: Camera, mount: CameraMount | None) -> str:
             f"{mount.forward_m:g} m ahead of the rear axle, {mount.height_m:g} m high, "
             f"{mount.pitch_deg:g} degrees down"
         )
+        if mount.left_m or mount.yaw_deg:
+            where += f", {mount.left_m:g} m and {mount.yaw_deg:g} degrees to the left"
     return (
         f"Frames     {camera.width} x {camera.height} px, fx {camera.fx:.2f}, fy "
         f"{camera.fy:.2f}, cx {camera.cx:.2f}, cy {camera.cy:.2f}, distortion {bent}\n"

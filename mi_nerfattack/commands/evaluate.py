@@ -160,7 +160,7 @@ class Evaluate:
         taken = place.car.control_unit if vehicle is None else vehicle.unit
         if reason := misfit(section.unit(), taken, section.source):
             raise InputError(f"policy: the car of the place {reason}")
-        check_policy(section.build(), place, routes)
+        check_policy(section.build(place.rig.views), place, routes)
         store = Store(self.drives)
         return EvaluateDrives(store, section, place, under, routes, settings, vehicle)
 

@@ -51,7 +51,8 @@ class ServePolicy:
         if self.size is not None and min(self.size) < 1:
             raise InputError(f"--size: {self.size}; width and height, 1 or more")
         variant.ensure()
-        policy = PolicyFile.read(self.policy, self.settings).section.build()
+        file = PolicyFile.read(self.policy, self.settings)
+        policy = file.section.build(file.views)
         if self.size is not None:
             import mitsuba as mi
 

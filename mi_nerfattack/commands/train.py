@@ -203,7 +203,7 @@ class Train:
                 raise InputError("--set: sets a key of --like, which is missing")
             return PolicyFile("--like")
         file = PolicyFile.read(self.like, self.settings)
-        if file.camera is None and file.vehicle is None:
+        if file.rig is None and file.vehicle is None:
             raise InputError(
                 f"--like: {self.like}; has neither [camera] nor [vehicle]: add one, or "
                 "leave the option out"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import mitsuba as mi
@@ -15,6 +16,7 @@ from mi_nerfattack.backend.colour import srgb_to_linear_numpy
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.render.camera.rig import Layout, Rig
 from mi_nerfattack.rollout.drive import Drive
 from mi_nerfattack.rollout.loop import numbers_of, stacked
 from mi_nerfattack.vehicle.dynamics import to_state
@@ -23,13 +25,13 @@ from mi_nerfattack.vehicle.route.route import Route
 
 @dataclass(frozen=True, eq=False)
 class CameraFrame:
-    """What the vehicle's camera observes.
+    """What the vehicle's camera observes, or its cameras, side by side.
 
     Args:
         image: (height, width, 3) uint8, sRGB.
         depth: (height, width) float32, metres along the ray through the pixel's
             centre, infinite where there is nothing.
-        camera_to_world: (4, 4) float64, OpenCV axes, metres.
+        camera_to_world: (4, 4) float64, OpenCV axes, metres; of the first camera.
         linear: (height, width, 3) float32, what the image was made of; None where the
             environment gives eight bits alone.
         split: takes the frame apart: called with the names of the objects, gives layers
@@ -71,6 +73,65 @@ class CameraFrame:
         return whole if self.split is None else whole | self.split(objects)
 
 
+def join_frames(frames: Sequence[CameraFrame], layout: Layout) -> CameraFrame:
+    """Lay the frames of a vehicle's cameras side by side.
+
+    Below those that are lower, the image is black, nothing is seen, and all depths are
+    infinite.
+
+    Args:
+        frames: of all cameras; a single one stays as it is.
+        layout: where they lie.
+    """
+    if len(frames) == 1:
+        return frames[0]
+    light = None
+    if all(frame.linear is not None for frame in frames):
+        light = layout.join([frame.light for frame in frames])
+    return CameraFrame(
+        layout.join([frame.image for frame in frames]),
+        _join_depths([frame.depth for frame in frames], layout),
+        frames[0].camera_to_world,
+        light,
+        partial(_join_layers, frames, layout),
+    )
+
+
+def first_frame(frame: CameraFrame, layout: Layout) -> CameraFrame:
+    """Return what the first of several cameras sees of a frame; undoes `join_frames`.
+
+    Args:
+        frame: of all.
+        layout: of their images.
+    """
+    if len(layout.sizes) == 1:
+        return frame
+    linear = None if frame.linear is None else layout.split(frame.linear)[0]
+    return CameraFrame(
+        layout.split(frame.image)[0],
+        layout.split(frame.depth[..., None])[0][..., 0],
+        frame.camera_to_world,
+        linear,
+    )
+
+
+def _join_depths(depths: Sequence[np.ndarray], layout: Layout) -> np.ndarray:
+    return layout.join([depth[..., None] for depth in depths], np.inf)[..., 0]
+
+
+def _join_layers(
+    frames: Sequence[CameraFrame], layout: Layout, objects: Sequence[str]
+) -> dict[str, np.ndarray]:
+    """Join the layers of frames; see :meth:`CameraFrame.layers`."""
+    layers = [frame.layers(objects) for frame in frames]
+    return {
+        name: _join_depths([each[name] for each in layers], layout)
+        if first.ndim == 2
+        else layout.join([each[name] for each in layers])
+        for name, first in layers[0].items()
+    }
+
+
 class AbstractEnvironment(ABC):
     """World that a policy drives in, one control period after the other.
 
@@ -79,13 +140,15 @@ class AbstractEnvironment(ABC):
 
     Attributes:
         name: "surrogate", "mitsuba", "mujoco", ...
-        camera: intrinsics of the observed images.
+        rig: the cameras whose images are observed, side by side.
+        camera: intrinsics of the first of them.
         period: seconds between two images.
         max_control: largest control that has an effect, in the unit that `step` takes.
         control_unit: "rad/s" of a heading rate, or "rad" of a steering angle.
     """
 
     name: str
+    rig: Rig
     camera: Camera
     period: float
     max_control: float
@@ -211,7 +274,7 @@ def drive(
 
     Args:
         environment: is reset; what it shows is left alone.
-        policy: sees sRGB images (1, height, width, 3) of eight bits, in [0, 1]; one
+        policy: sees sRGB frames (1, height, width, 3) of eight bits, in [0, 1]; one
             with memory starts with its initial one.
         route: whose goal the policy gets, and to which errors are measured.
         pose: (3,), of the start, metres and radians.

@@ -178,7 +178,8 @@ class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
 def _observations(
     environment: AbstractEnvironment, routes: Sequence[Route]
 ) -> gymnasium.spaces.Dict:
-    size = (environment.camera.height, environment.camera.width)
+    width, height = environment.rig.size
+    size = (height, width)
     box, goals = gymnasium.spaces.Box, max(route.goal for route in routes) + 1
     return gymnasium.spaces.Dict(
         {
@@ -220,6 +221,7 @@ def make_gym(
     variant.ensure()
     place = bundled_place(place) if isinstance(place, str) else place
     if size_px is not None:
+        place.rig.require_one("size_px", "leave it out, and size each camera")
         place = replace(place, camera=place.camera.resized(*size_px))
     found = load_routes(place.routes, routes)
     environment = make_environment(name, place, conditions)

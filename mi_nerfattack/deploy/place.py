@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Count, Finite, NonNegative, Seconds, Share, checked
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
 from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.camera.rig import ONLY, Rig
 from mi_nerfattack.render.pathtrace.load import DAYLIGHT
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -71,7 +72,7 @@ class Place:
         field_pose: field to world; None where they are the same.
         routes: JSON.
         objects: grid fields that may stand beside the road.
-        camera: of the vehicle.
+        camera: of the vehicle; the first one, if it has several.
         mount: where the camera sits on it.
         period: seconds between two images.
         car: what drives.
@@ -80,6 +81,8 @@ class Place:
         recording: of `replay`: a folder, a video or a log.
         topics: of such a log, "NAME=/topic", see `McapTopics`.
         server: of `carla`: "HOST:PORT" or "HOST:PORT/TOWN".
+        camera_name: of the first camera.
+        others: cameras besides it, to the right of it in a frame; None for none.
     """
 
     scene: Path
@@ -95,6 +98,24 @@ class Place:
     topics: tuple[str, ...] = ()
     server: str = "127.0.0.1:2000"
     field_pose: Pose | None = None
+    camera_name: str = ONLY
+    others: Rig | None = None
+
+    @property
+    def rig(self) -> Rig:
+        """All cameras of the vehicle."""
+        rig = Rig.of_one(self.camera, self.mount, self.camera_name)
+        return rig if self.others is None else rig + self.others
+
+    def with_rig(self, rig: Rig) -> Place:
+        """Return the place with other cameras on the vehicle."""
+        return replace(
+            self,
+            camera=rig.cameras[0],
+            mount=rig.mounts[0],
+            camera_name=rig.names[0],
+            others=rig.others,
+        )
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 from mi_nerfattack.deploy.built_in import built_in_shapes
 from mi_nerfattack.deploy.environment import AbstractEnvironment
@@ -31,11 +31,14 @@ def kinematic_vehicle(place: Place) -> KinematicVehicle:
     return KinematicVehicle(motion, place.period, car.max_control, car.control_unit)
 
 
-def mitsuba_view(place: Place, conditions: Conditions) -> MitsubaView:
-    """Load a place's scene as seen under conditions."""
+def mitsuba_views(place: Place, conditions: Conditions) -> list[MitsubaView]:
+    """Load a place's scene, seen by each of its cameras under conditions."""
     scene = load_scene(place.scene, shapes=built_in_shapes(conditions.built_in))
     set_daylight(scene, conditions.sky)
-    return MitsubaView(scene, place.camera, conditions.spp, conditions.exposure_ev)
+    return [
+        MitsubaView(scene, camera, conditions.spp, conditions.exposure_ev)
+        for camera in place.rig.cameras
+    ]
 
 
 def _surrogate(place: Place, conditions: Conditions) -> AbstractEnvironment:
@@ -46,20 +49,20 @@ def _surrogate(place: Place, conditions: Conditions) -> AbstractEnvironment:
         )
     _refuse_built_in("surrogate", conditions)
     scene = PosedField(load_field(place.field), place.field_pose)
-    sensor = field_sensor(scene, [], place.camera, place.mount)
+    sensor = field_sensor(scene, [], place.camera, place.mount).with_rig(place.rig)
     return SurrogateEnvironment(sensor, kinematic_vehicle(place))
 
 
 def _mitsuba(place: Place, conditions: Conditions) -> AbstractEnvironment:
     vehicle = kinematic_vehicle(place)
-    return _pair("mitsuba", vehicle, mitsuba_view(place, conditions), place)
+    return _pair("mitsuba", vehicle, mitsuba_views(place, conditions), place)
 
 
 def _mujoco(place: Place, conditions: Conditions) -> AbstractEnvironment:
     from mi_nerfattack.deploy.mujoco.vehicle import MujocoVehicle
 
     vehicle = MujocoVehicle(place.car, period=place.period)
-    return _pair("mujoco", vehicle, mitsuba_view(place, conditions), place)
+    return _pair("mujoco", vehicle, mitsuba_views(place, conditions), place)
 
 
 def _mujoco_gl(place: Place, conditions: Conditions) -> AbstractEnvironment:
@@ -68,9 +71,12 @@ def _mujoco_gl(place: Place, conditions: Conditions) -> AbstractEnvironment:
 
     scene = load_scene(place.scene)
     set_daylight(scene, conditions.sky)
-    view = MujocoView(scene, place.camera, conditions.built_in, conditions.exposure_ev)
+    views = [
+        MujocoView(scene, camera, conditions.built_in, conditions.exposure_ev)
+        for camera in place.rig.cameras
+    ]
     vehicle = MujocoVehicle(place.car, period=place.period)
-    return _pair("mujoco_gl", vehicle, view, place)
+    return _pair("mujoco_gl", vehicle, views, place)
 
 
 def _carla(place: Place, conditions: Conditions) -> AbstractEnvironment:
@@ -78,6 +84,7 @@ def _carla(place: Place, conditions: Conditions) -> AbstractEnvironment:
     from mi_nerfattack.deploy.carla.environment import CarlaEnvironment
     from mi_nerfattack.deploy.carla.session import CarlaServer
 
+    place.rig.require_one("environment 'carla'", _OTHER)
     _refuse_built_in("carla", conditions)
     _refuse_disturbed("carla", conditions)
     server = CarlaServer.parse(place.server, weather=_CARLA_WEATHER[conditions.sky])
@@ -105,6 +112,7 @@ def _replay(place: Place, conditions: Conditions) -> AbstractEnvironment:
             "environment 'replay': the place has no recording; give it a folder, a "
             "video or an MCAP log"
         )
+    place.rig.require_one("environment 'replay'", _OTHER)
     _refuse_built_in("replay", conditions)
     _refuse_disturbed("replay", conditions)
     recording = open_recording(
@@ -137,9 +145,13 @@ def _refuse_disturbed(name: str, conditions: Conditions) -> None:
 
 
 def _pair(
-    name: str, vehicle: AbstractVehicle, view: AbstractView, place: Place
+    name: str, vehicle: AbstractVehicle, views: Sequence[AbstractView], place: Place
 ) -> SimulatedEnvironment:
-    return SimulatedEnvironment(name, vehicle, view, place.mount, place.period)
+    return SimulatedEnvironment(name, vehicle, views, place.rig, place.period)
+
+
+#: What takes several cameras.
+_OTHER = "drive in 'surrogate', 'mitsuba', 'mujoco' or 'mujoco_gl'"
 
 
 #: CARLA's weather for our times of day; its sun is not ours.

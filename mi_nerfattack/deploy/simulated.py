@@ -12,17 +12,15 @@ import numpy as np
 from mi_nerfattack.deploy.environment import (
     AbstractEnvironment,
     CameraFrame,
+    join_frames,
     policy_image,
 )
 from mi_nerfattack.deploy.vehicle import AbstractVehicle, checked_pose
 from mi_nerfattack.deploy.views.paste import AbstractView
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.disturbance import disturbed
-from mi_nerfattack.render.camera.intrinsics import (
-    Camera,
-    CameraMount,
-    camera_to_body,
-)
+from mi_nerfattack.render.camera.intrinsics import Camera, camera_to_body
+from mi_nerfattack.render.camera.rig import Rig, camera_seed
 from mi_nerfattack.vehicle.route.route import Route
 
 
@@ -32,16 +30,17 @@ class AbstractSimulation(AbstractEnvironment):
     Args:
         name: of the environment.
         vehicle: moves.
-        camera: intrinsics.
+        rig: cameras.
         period: seconds that the vehicle holds a control.
     """
 
     def __init__(
-        self, name: str, vehicle: AbstractVehicle, camera: Camera, period: float
+        self, name: str, vehicle: AbstractVehicle, rig: Rig, period: float
     ) -> None:
         self.name: str = name
         self.vehicle: AbstractVehicle = vehicle
-        self.camera: Camera = camera
+        self.rig: Rig = rig
+        self.camera: Camera = rig.cameras[0]
         self.period: float = period
         self.max_control: float = vehicle.max_control
         self.control_unit: str = vehicle.control_unit
@@ -87,9 +86,16 @@ class AbstractSimulation(AbstractEnvironment):
             return frame
         image = policy_image(frame.image)
         exposure, blur = np.zeros((1, 3)), np.full(1, self.blur_px)
-        draw = self.noise_sd, self._seed, self._steps
-        seen = np.array(disturbed(image, exposure, blur, *draw))[0]
-        image = np.round(255 * seen).astype(np.uint8)
+        seen = disturbed(
+            image,
+            exposure,
+            blur,
+            self.noise_sd,
+            self._seed,
+            self._steps,
+            layout=self.rig.layout,
+        )
+        image = np.round(255 * np.array(seen)[0]).astype(np.uint8)
         return replace(frame, image=image, linear=frame.light)
 
     @abstractmethod
@@ -103,8 +109,8 @@ class SimulatedEnvironment(AbstractSimulation):
     Args:
         name: of the pair.
         vehicle: moves.
-        view: renders.
-        mount: the camera's place on the vehicle.
+        views: render, one for each camera.
+        rig: the cameras.
         period: seconds that the vehicle holds a control.
     """
 
@@ -112,23 +118,31 @@ class SimulatedEnvironment(AbstractSimulation):
         self,
         name: str,
         vehicle: AbstractVehicle,
-        view: AbstractView,
-        mount: CameraMount,
+        views: Sequence[AbstractView],
+        rig: Rig,
         period: float,
     ) -> None:
-        super().__init__(name, vehicle, view.camera, period)
-        self.view, self._mount = view, camera_to_body(mount)
+        super().__init__(name, vehicle, rig, period)
+        self.views = list(views)
+        self._mounts = [camera_to_body(mount) for mount in rig.mounts]
 
     def show(self, objects: Sequence[Any]) -> None:
-        """Show fields, in the view's way."""
-        self.view.show(objects)
+        """Show fields, in the views' way."""
+        for view in self.views:
+            view.show(objects)
 
     def close(self) -> None:
-        """Close the view."""
-        self.view.close()
+        """Close the views."""
+        for view in self.views:
+            view.close()
 
     def _observe(self) -> CameraFrame:
-        pose = self.vehicle.body_to_world @ self._mount
         # 32 bits each: a seed of its own for every frame of every drive
         sequence = np.random.SeedSequence([self._seed, self._steps])
-        return self.view.render(pose, int(sequence.generate_state(1)[0]))
+        seed, body = int(sequence.generate_state(1)[0]), self.vehicle.body_to_world
+        pairs = zip(self.views, self._mounts, strict=True)
+        frames = [
+            view.render(body @ mount, camera_seed(seed, index))
+            for index, (view, mount) in enumerate(pairs)
+        ]
+        return join_frames(frames, self.rig.layout)

@@ -25,7 +25,7 @@ from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.io import load_grid
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.conventions import to_colmap
-from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.render.pathtrace.load import DAYLIGHT, load_scene, scene_files
 from mi_nerfattack.vehicle.expert import AbstractExpert, expert_for
 from mi_nerfattack.vehicle.route.route import Route, load_routes
@@ -80,8 +80,8 @@ class AbstractSite(ABC):
 
     @property
     @abstractmethod
-    def camera(self) -> Camera:
-        """Intrinsics of the frames."""
+    def rig(self) -> Rig:
+        """The cameras of the frames."""
 
     @property
     @abstractmethod
@@ -154,9 +154,9 @@ class PlaceSite(AbstractSite):
             )
 
     @property
-    def camera(self) -> Camera:
-        """Intrinsics of the place's camera."""
-        return self.place.camera
+    def rig(self) -> Rig:
+        """The place's cameras."""
+        return self.place.rig
 
     @property
     def car(self) -> Any:
@@ -212,13 +212,14 @@ class PlaceSite(AbstractSite):
             "environment": self.name,
             "files": _checksums(paths),
             "camera": to_colmap(place.camera)[1],
-            "mount": asdict(place.mount),
+            "mount": place.mount.described(),
             "car": asdict(place.car),
             "period": place.period,
             "weather": asdict(self.weather),
             **({} if self.vehicle is None else {"vehicle": dict(self.vehicle)}),
             **_engine(self.name, place),
             **_posed(place),
+            **_others(place),
         }
 
 
@@ -246,6 +247,11 @@ def _posed(place: Place) -> dict[str, Any]:
         return {}
     rows = pose.rotation.tolist(), pose.translation.tolist()
     return {"field_pose": [*rows, pose.scale]}
+
+
+def _others(place: Place) -> dict[str, Any]:
+    """Return all cameras, if there are several."""
+    return {} if place.others is None else {"cameras": place.rig.described()}
 
 
 def _engine(name: str, place: Place) -> dict[str, str]:

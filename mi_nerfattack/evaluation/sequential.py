@@ -21,9 +21,10 @@ from pydantic import ValidationError, model_validator
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
+from mi_nerfattack.io.overrides import tell
 from mi_nerfattack.io.strict import parse_toml
 from mi_nerfattack.ranges import Fraction, NonNegative
-from mi_nerfattack.scenario.section import Section, problems, refuse, tell
+from mi_nerfattack.scenario.section import Section, problems, refuse
 
 GO_ON, ACCEPT, REJECT = "go on", "accept", "reject"
 #: Rates that are closer take hundreds of drives to tell apart.

@@ -33,6 +33,7 @@ from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.io import files
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.render.camera.intrinsics import from_fov
+from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.rollout.drive import EXPERT, NO_OBJECT, Drive, departure_limits
 from mi_nerfattack.rollout.loop import OnStep
 from mi_nerfattack.scenario.named_file import section_content
@@ -184,7 +185,8 @@ class EvaluateDriver(AbstractDriver):
     def __init__(self, work: EvaluateDrives) -> None:
         super().__init__()
         self._work = work
-        self._policy, self._place = work.policy.build(), work.build_place()
+        self._place = work.build_place()
+        self._policy = work.policy.build(self._place.rig.views)
         self._objects, self._surroundings = load_objects(work)
 
     def drive(self, spec: DriveSpec, on_step: OnStep) -> Drive:
@@ -211,7 +213,7 @@ class EvaluateDriver(AbstractDriver):
     def _make(self, under: EnvironmentUnder, blind: bool) -> AbstractEnvironment:
         place, conditions = self._place, under.conditions
         if blind:
-            place = replace(place, camera=_EXPERT_CAMERA)
+            place = place.with_rig(Rig.of_one(_EXPERT_CAMERA, place.mount))
             conditions = replace(conditions, spp=1)
         return make_environment(under.name, place, conditions)
 
@@ -305,7 +307,8 @@ def check_policy(policy: AbstractPolicy, place: Place, routes: Sequence[Route]) 
     Raises:
         InputError: the camera's image or a goal does not fit.
     """
-    shape = (1, place.camera.height, place.camera.width, 3)
+    width, height = place.rig.size
+    shape = (1, height, width, 3)
     image, numbers = mi.TensorXf(np.zeros(shape, np.float32)), None
     if size := policy.numbers.size:
         numbers = mi.TensorXf(np.zeros((1, size), np.float32))

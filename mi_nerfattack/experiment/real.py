@@ -60,7 +60,9 @@ class Course:
     def of(cls, found: FoundAttack) -> Course:
         """Return that of a run."""
         scenario, route = found.scenario, found.route
-        camera, mount = scenario.camera.build()
+        rig = scenario.rig()
+        rig.require_one(f"{found.folder}", "recordings show one camera's images")
+        camera, mount = rig.cameras[0], rig.mounts[0]
         if scenario.scene.surrogate is not None:
             camera = build_surrogate(scenario).intrinsics
         period, car = scenario.vehicle.dt_s, scenario.vehicle.car()

@@ -51,7 +51,7 @@ def texture_figures(
     picked = np.unique(np.linspace(0, len(driven.states) - 1, FRAMES).astype(int))
     world.show(own)
     states = [to_state(driven.poses[None, step]) for step in picked]
-    weights = seen_weights(world.surrogate, world.fields, states)
+    weights = seen_weights(world.surrogate.through(0), world.fields, states)
     world.show(attacked)
     camera = world.surrogate.intrinsics
     # A colour's sigmoid rises by a quarter there, in each channel of a pixel it fills.

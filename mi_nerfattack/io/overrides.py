@@ -1,16 +1,21 @@
-"""Keys of a TOML document that the command line sets: ``--set KEY=VALUE``."""
+"""Keys of a TOML document: those that ``--set KEY=VALUE`` sets, and those at fault."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import tomlkit
+from tomlkit.container import OutOfOrderTableProxy
+from tomlkit.items import AoT, Table
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io.strict import parse_toml
 
+_MARK = "a line that no file has"
+_MOST_PROBLEMS = 8  # that are told
 _KEY = re.compile(r"[\w-]+(?:\.[\w-]+)*")
 _WORD = re.compile(r"[A-Za-z./~][^\s\"']*")  # a string that needs no quotes
 
@@ -81,6 +86,65 @@ def find_setting(settings: Sequence[str], location: Sequence[str | int]) -> str 
         if parts == [*location][: len(parts)]:
             return setting
     return None
+
+
+def tell(
+    path: str | Path,
+    text: str,
+    found: Iterable[tuple[Sequence[str | int], str]],
+    settings: Sequence[str] = (),
+) -> str:
+    """Tell problems of a file, each with its line and key; of many, the first.
+
+    Args:
+        path: the file.
+        text: its content, valid TOML.
+        found: keys that lead to each problem, and what is wrong.
+        settings: of the command line, see :func:`set_keys`; a problem of one of
+            them is told with the setting in place of a line.
+    """
+    found, lines = list(found), []
+    for location, problem in found[:_MOST_PROBLEMS]:
+        if setting := find_setting(settings, location):
+            where = f"--set {setting}"
+        else:
+            line = _line_of(text, location)
+            where = f"{path}:{line}" if line else f"{path}"
+        key = ".".join(map(str, location))
+        lines.append(f"{where}: {key}: {problem}")
+    if more := len(found) - len(lines):
+        lines.append(f"{path}: and {more} more")
+    return "\n".join(lines)
+
+
+def _line_of(text: str, location: Sequence[str | int]) -> int | None:
+    """Find the line of a key, or of the table that lacks it; 1-based.
+
+    Of a table without a header, such as dotted keys make, it is that of its first key.
+    """
+    document = tomlkit.parse(text)
+    item: Any = document
+    holder: Any = None
+    key: Any = None
+    for part in location:
+        inner = item.get(part) if isinstance(part, str) else item[part]
+        if inner is None:
+            break
+        holder, key, item = item, part, inner
+        if not isinstance(inner, Table | AoT | OutOfOrderTableProxy):
+            break  # a value, or an inline table
+    if holder is None:
+        return None
+    while isinstance(item, AoT | OutOfOrderTableProxy) or (
+        isinstance(item, Table) and item.is_super_table()
+    ):
+        holder, key = item, 0 if isinstance(item, AoT) else next(iter(item))
+        item = holder[key]
+    if isinstance(item, Table):
+        item.comment(_MARK)
+    else:
+        holder[key] = _MARK
+    return tomlkit.dumps(document).partition(_MARK)[0].count("\n") + 1
 
 
 def _parts(key: str) -> Iterator[str | int]:

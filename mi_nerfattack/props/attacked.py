@@ -234,7 +234,8 @@ def seen_most(box: AttackedBox, views: Views) -> str:
 def placed(found: FoundAttack) -> tuple[list[Pose], Views]:
     """Return where the scenario puts its objects, and where they were seen from."""
     scenario = found.scenario
-    camera, mount = scenario.camera.build()
+    rig = scenario.rig()
+    camera, mount = rig.cameras[0], rig.mounts[0]
     if scenario.scene.surrogate is None:
         poses = [item.pose for item in scenario.objects]
     else:

@@ -33,7 +33,7 @@ from mi_nerfattack.car.drive.pilot import Control
 from mi_nerfattack.car.drive.rig import Overlaid, Rig, Trained, begin_control
 from mi_nerfattack.deploy.car import Car
 from mi_nerfattack.deploy.place import Conditions, Place, bundled_place
-from mi_nerfattack.deploy.registry import mitsuba_view
+from mi_nerfattack.deploy.registry import mitsuba_views
 from mi_nerfattack.deploy.views.paste import AbstractView
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import (
@@ -281,7 +281,7 @@ def simulated_camera(
         spp: samples per pixel.
         seed: of the samples.
     """
-    view = mitsuba_view(replace(place, car=room.car), Conditions(spp=spp))
+    (view,) = mitsuba_views(replace(place, car=room.car), Conditions(spp=spp))
 
     def pose() -> TrackedPose:
         return room.pose_before(FRAME_LATENCY_S, _STEP_S)

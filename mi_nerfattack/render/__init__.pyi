@@ -3,6 +3,7 @@ from .camera.intrinsics import CameraMount as CameraMount
 from .camera.intrinsics import from_fov as from_fov
 from .camera.intrinsics import look_at as look_at
 from .camera.pose import Pose as Pose
+from .camera.rig import Rig as Rig
 from .composite import AbstractComposite as AbstractComposite
 from .composite import DepthComposite as DepthComposite
 from .interleaved import InterleavedComposite as InterleavedComposite

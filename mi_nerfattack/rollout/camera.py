@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 from functools import cache
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera.intrinsics import CameraMount
+from mi_nerfattack.render.camera.conventions import from_mitsuba, mitsuba_sensor_dict
+from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
 from mi_nerfattack.render.camera.lens import mount_pose
+from mi_nerfattack.render.camera.rig import camera_seed
 from mi_nerfattack.rollout.variation import Variation
 
 
@@ -49,13 +53,16 @@ class SceneCamera:
         self.seed: int = seed
         self.centred, self.first = centred, first
         self.variation: Variation | None = variation
-        self._mounts: dict[int, tuple[Any, Any]] = {}  # by the number of drives
-        self._lights: dict[int, mi.Color3f] = {}
+        self._forget()
         if centred and math.isqrt(self.spp) ** 2 != self.spp:
             raise InputError(
                 f"samples per pixel: {self.spp}; rays through the middles of squares "
                 "need 1, 4, 9, ..."
             )
+
+    def _forget(self) -> None:
+        self._mounts: dict[int, tuple[Any, Any]] = {}  # by the number of drives
+        self._lights: dict[int, mi.Color3f] = {}
 
     @property
     def size(self) -> tuple[int, int]:
@@ -136,11 +143,49 @@ class SceneCamera:
         within, aperture = (dr.gather(mi.Point2f, x, ray) for x in (within, aperture))
         return sampler, within, aperture
 
-    def changed(self, first: int, variation: Variation | None) -> SceneCamera:
-        """Return this camera with other draws."""
-        return SceneCamera(
-            self.sensor, self.mount, self.seed, self.centred, first, variation
+    def changed(self, **attributes: Any) -> SceneCamera:
+        """Return this camera with another mount, or with other draws."""
+        result = copy(self)
+        vars(result).update(attributes)
+        result._forget()
+        return result
+
+    def another(self, camera: Camera, mount: CameraMount, index: int) -> SceneCamera:
+        """Return another camera of the same vehicle.
+
+        It has the same clip distances, samples per pixel and draws; its random numbers
+        are others.
+
+        Args:
+            camera: intrinsics.
+            mount: pose on the vehicle.
+            index: of the camera among all, this one being the first.
+        """
+        own = mi.traverse(self.sensor)
+        clip = {k: np.array(own[k]).item() for k in ("near_clip", "far_clip")}
+        described = mitsuba_sensor_dict(camera, np.eye(4), self.spp)
+        return self.changed(
+            sensor=mi.load_dict(described | clip),
+            mount=mount,
+            seed=camera_seed(self.seed, index),
         )
+
+    @property
+    def intrinsics(self) -> Camera:
+        """The lens, for other environments.
+
+        Raises:
+            InputError: the sensor is no pinhole camera, or its film is cropped.
+        """
+        name = self.sensor.id()
+        if self.sensor.needs_aperture_sample():
+            raise InputError(f"sensor {name!r}: has an aperture; use perspective")
+        found, _ = from_mitsuba(self.sensor)
+        if self.size != (found.width, found.height):
+            raise InputError(
+                f"sensor {name!r}: its film has a crop window; remove crop_* from it"
+            )
+        return found
 
     def light(self, count: int) -> mi.Color3f | None:
         """Return factors of the light on objects, (3, n), ray by ray; None for 1."""
@@ -166,7 +211,9 @@ class SceneCamera:
         """Return the cameras' positions, and the columns of their rotations."""
         state = mi.Float(pose[0]), mi.Float(pose[1]), mi.Float(pose[2])
         height, pitch = self._mount(dr.width(pose))
-        found = mount_pose(state, height, self.mount.forward_m, pitch)
+        mount = self.mount
+        ahead, left, yaw = mount.forward_m, mount.left_m, mount.yaw_deg
+        found = mount_pose(state, height, ahead, pitch, left, yaw)
         dr.eval(found)
         return found
 
@@ -213,6 +260,20 @@ class SceneCamera:
             index = dr.arange(mi.UInt32, dr.width(d_linear) * spp) // spp
             d_linear = dr.gather(mi.Color3f, d_linear, index) / spp
         return mi.Spectrum(d_linear)
+
+
+def sensor_of(scene: mi.Scene, index: int) -> mi.Sensor:
+    """Return a scene's sensor by its index; InputError where there is none."""
+    count = len(scene.sensors())
+    if not 0 <= index < count:
+        raise InputError(f"sensor: {index}; the scene has {count}, from 0 on")
+    return scene.sensors()[index]
+
+
+def pose_of(state: Any) -> Any:
+    """Return the rows px, py, theta of a state, (3, n), detached."""
+    kind = dr.float64_array_t(mi.Vector3f)
+    return kind(*[dr.detach(state[i]) for i in range(3)])
 
 
 def keyed_sampler(

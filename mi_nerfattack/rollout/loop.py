@@ -131,7 +131,7 @@ class ClosedLoop:
         """Return the image that the policy gets, (n, height, width, 3), evaluated."""
         image = observation.image
         if self.disturbance:
-            image = self.disturbance.apply(image, step)
+            image = self.disturbance.apply(image, step, self.sensor.layout)
         if self.eight_bit:
             # a literal would be multiplied by its inverse, which is off in the last bit
             most = dr.opaque(type(image.array), 255)
@@ -143,7 +143,8 @@ class ClosedLoop:
         """Return the derivative by the sensor's image from that by the policy's."""
         if not self.disturbance:
             return d_shown
-        return self.disturbance.vjp(observation.image, step, d_shown)
+        layout = self.sensor.layout
+        return self.disturbance.vjp(observation.image, step, d_shown, layout)
 
 
 def numbers_of(

@@ -9,15 +9,16 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.backend.arrays import differentiates_rays, vjp
 from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.fields.vertex_colours import gradient
 from mi_nerfattack.render.backdrop import Layer
-from mi_nerfattack.render.camera.conventions import from_mitsuba
+from mi_nerfattack.render.camera.disturbance import side_by_side
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
+from mi_nerfattack.render.camera.rig import ONLY, Layout, Rig
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.rollout.camera import SceneCamera
-from mi_nerfattack.rollout.parameters import CollectsRays, Differentiated
+from mi_nerfattack.rollout.camera import SceneCamera, sensor_of
+from mi_nerfattack.rollout.images import SceneImages
+from mi_nerfattack.rollout.parameters import Differentiated
 from mi_nerfattack.rollout.sensor import (
     AbstractDifferentiableSensor,
     AbstractSensor,
@@ -27,7 +28,7 @@ from mi_nerfattack.rollout.variation import Variation
 
 
 class SceneSensor(AbstractDifferentiableSensor):
-    """Camera on a vehicle that sees a Mitsuba scene as its integrator renders it.
+    """Cameras on a vehicle that see a Mitsuba scene as its integrator renders it.
 
     An image is that of `mi.render` with the scene's sensor on the vehicle, developed
     by a box filter: lens, clip distances, film size and samples per pixel are the
@@ -36,6 +37,9 @@ class SceneSensor(AbstractDifferentiableSensor):
     the protocol of Mitsuba's `RBIntegrator`, as `field_integrator`, `prb`, `prbvolpath`
     and `volprim_rf_basic` have it. Lens and film are constants of the derivative, and
     so is the shape of surfaces, since visibility has no derivative here.
+
+    A sensor has one camera, until :meth:`with_rig` adds others: then the images of all
+    lie side by side in a frame.
 
     Args:
         scene: metric, z up.
@@ -74,38 +78,36 @@ class SceneSensor(AbstractDifferentiableSensor):
             )
         self.scene = scene
         self.integrator: Any = integrator or scene.integrator()
-        if not differentiates_rays(self.integrator):
-            raise InputError(
-                f"scene: its integrator {self.integrator.class_name()} cannot be "
-                "differentiated ray by ray; use field_integrator or prb"
-            )
+        self._images = SceneImages(scene, self.integrator)
         if isinstance(sensor, int):
-            sensor = _sensor_of(scene, sensor)
-        self.camera: SceneCamera = SceneCamera(
-            sensor, mount or CameraMount(), seed, centred
-        )
-        #: A `field_integrator`, which marches rays of several frames together.
-        self._collector: CollectsRays | None = None
-        if isinstance(self.integrator, CollectsRays):
-            self._collector = self.integrator
-        self._parameters = Differentiated(scene, self._collector)
+            sensor = sensor_of(scene, sensor)
+        camera = SceneCamera(sensor, mount or CameraMount(), seed, centred)
+        self.cameras: tuple[SceneCamera, ...] = (camera,)
+        self.names: tuple[str, ...] = (ONLY,)
+        self._parameters = Differentiated(scene, self._images.collector)
         self.select(params)
         self._lit: set[int] = set()  # layers whose light varies
         self._counter = [0]  # shared by copies
 
     def __repr__(self) -> str:
-        kind, (width, height) = type(self.integrator).__name__, self.camera.size
+        kind, (width, height) = type(self.integrator).__name__, self._layout.size
         return f"SceneSensor({kind}, {width}x{height}, params={list(self.keys)})"
 
     def observe(self, state: Any, step: int) -> Observation:
         """Render a frame; see :meth:`AbstractSensor.observe`."""
-        count = dr.width(state)
-        self._counter[0] += count
-        # From the state to rays, to their radiance, and to linear pixels
-        with dr.suspend_grad():
-            sampler, *view = self.camera.rays(pose_of(state), count, step)
-            linear, kept = self._render(sampler, view, None)
-        return self._observation(linear, kept, view, count, step)
+        self._counter[0] += dr.width(state)
+        parts = [
+            self._images.observe(each, state, step, self._gains(each, state))
+            for each in self.cameras
+        ]
+        return self._join(parts)
+
+    def _join(self, parts: list[Observation]) -> Observation:
+        if len(parts) == 1:
+            return parts[0]
+        image = side_by_side([part.image for part in parts], self._layout)
+        dr.eval(image)
+        return Observation(image, parts[0].step, parts=tuple(parts))
 
     @property
     def renders(self) -> int:
@@ -114,12 +116,13 @@ class SceneSensor(AbstractDifferentiableSensor):
 
     def numbered(self, first: int) -> SceneSensor:
         """See :meth:`AbstractSensor.numbered`; the scene is shared."""
-        return self._drawing(first, self.camera.variation)
+        return self._drawing(first=first)
 
     def varied(self, variation: Variation) -> SceneSensor:
         """Return this sensor with another light and mount in each drive of a batch.
 
-        The light varies on the :attr:`objects` that there are now.
+        All cameras of a vehicle are raised and pitched alike. The light varies on the
+        :attr:`objects` that there are now.
 
         Raises:
             InputError: light on objects, and there are none.
@@ -130,7 +133,7 @@ class SceneSensor(AbstractDifferentiableSensor):
                 "light: there are no objects whose light could vary; show grid fields "
                 "by a field_integrator, and select their colours"
             )
-        result = self._drawing(self.camera.first, variation)
+        result = self._drawing(variation=variation)
         result._lit = objects
         return result
 
@@ -142,30 +145,28 @@ class SceneSensor(AbstractDifferentiableSensor):
         result = self if camera.variation is None else self.varied(camera.variation)
         return result.numbered(camera.first)
 
-    def _drawing(self, first: int, variation: Variation | None) -> SceneSensor:
+    def _drawing(self, **changes: Any) -> SceneSensor:
+        cameras = [camera.changed(**changes) for camera in self.cameras]
+        return self._with(self.names, cameras)
+
+    def _with(
+        self, names: Sequence[str], cameras: Sequence[SceneCamera]
+    ) -> SceneSensor:
         result = copy(self)
-        result.camera = self.camera.changed(first, variation)
+        result.names, result.cameras = tuple(names), tuple(cameras)
         return result
 
     def keep(self, observation: Observation) -> Any:
-        """Keep what the integrator has to, or else the pixels and its whole state."""
-        if self._collector is not None:
-            return self._collector.keep(observation.kept)
-        return observation.linear, observation.kept
+        """Keep what the integrator has to of each camera's image."""
+        return [self._images.keep(each) for each in observation.parts or [observation]]
 
     def restore(self, state: Any, step: int, kept: Any) -> Observation:
         """See :meth:`AbstractDifferentiableSensor.restore`."""
-        count = dr.width(state)
-        # The same rays again, whose fields are not marched again
-        with dr.suspend_grad():
-            sampler, *view = self.camera.rays(pose_of(state), count, step)
-            if self._collector is None:
-                linear, inner = kept
-            else:
-                dr.eval(view)
-                inner = self._collector.restore(view[0], kept)
-                linear, inner = self._render(sampler, view, inner)
-        return self._observation(linear, inner, view, count, step)
+        parts = [
+            self._images.restore(camera, state, step, one)
+            for camera, one in zip(self.cameras, kept, strict=True)
+        ]
+        return self._join(parts)
 
     def vjp(
         self, observation: Observation, state: Any, d_image: Any, attached: bool
@@ -175,81 +176,96 @@ class SceneSensor(AbstractDifferentiableSensor):
         Raises:
             InputError: `attached`, and the integrator has no derivative by its rays.
         """
-        # From the developed image back to the radiance of each sample
-        d_linear = vjp(_develop, observation.linear, _colours(d_image))
-        leaf, view = None, observation.view
-        count, step = dr.width(state), observation.step
-        if attached:
-            self.check_attached()
-            leaf = pose_of(state)
-            dr.enable_grad(leaf)
-            _, *view = self.camera.rays(leaf, count, step)
-        with dr.suspend_grad():
-            ray, weight = view
-            δL = self.camera.spread(d_linear) * dr.detach(weight)
-            # From the radiance to the parameters and, through its rays, to the state
-            with dr.isolate_grad():
-                sampler, kept = self.camera.sampler(count, step), observation.kept
-                self._sample(dr.ADMode.Backward, sampler, ray, δL, kept)
-        if leaf is None:
-            return None
-        result = dr.grad(leaf)
-        dr.eval(result)
-        return result
+        # Each camera adds to the gradients of the parameters, and to the state's
+        parts, by_pose = observation.parts or [observation], None
+        d_parts = self._layout.split(d_image)
+        for item in zip(self.cameras, parts, d_parts, strict=True):
+            camera, part, d_part = item
+            by_one = self._images.vjp(camera, part, state, d_part, attached)
+            by_pose = by_one if by_pose is None else by_pose + by_one
+        dr.eval(by_pose)
+        return by_pose
 
-    def _render(
-        self, sampler: mi.Sampler, view: Any, state_in: Any
-    ) -> tuple[mi.Color3f, Any]:
-        """Return linear pixels, and the integrator's state."""
-        ray, weight = view
-        mode = dr.ADMode.Primal
-        gains = [] if state_in is not None else self._gains(dr.width(ray.o))
-        colour, _, _, kept = self._sample(mode, sampler, ray, None, state_in, gains)
-        linear = self.camera.pixels(colour * weight)
-        dr.eval(linear, kept)
-        return linear, kept
-
-    def _sample(
-        self,
-        mode: dr.ADMode,
-        sampler: mi.Sampler,
-        ray: mi.Ray3f,
-        δL: Any = None,
-        state_in: Any = None,
-        gains: Sequence[mi.Color3f] = (),
-    ) -> tuple[Any, ...]:
-        lit = {"gains": gains} if gains else {}
-        return self.integrator.sample(
-            mode=mode,
-            scene=self.scene,
-            sampler=sampler,
-            ray=ray,
-            depth=mi.UInt32(0),
-            δL=δL,
-            δaovs=None,
-            state_in=state_in,
-            active=mi.Bool(True),
-            width=self.camera.size[0] * self.camera.spp,
-            **lit,
-        )
-
-    def _gains(self, rays: int) -> list[mi.Color3f]:
+    def _gains(self, camera: SceneCamera, state: Any) -> list[mi.Color3f]:
         """Return the variation's factors of all layers, (3, n) each; none for 1."""
-        light = self.camera.light(rays // self.camera.per_image)
+        light = camera.light(dr.width(state))
         if light is None:
             return []
         plain = mi.Color3f(1)
         return [light if id(x) in self._lit else plain for x in self.layers]
 
-    def _observation(
-        self, linear: mi.Color3f, kept: Any, view: Any, count: int, step: int
-    ) -> Observation:
-        width, height = self.camera.size
-        with dr.suspend_grad():
-            pixels = dr.ravel(_develop(linear))
-            dr.eval(pixels)
-        image = mi.TensorXf(pixels, (count, height, width, 3))
-        return Observation(image, step, linear, kept, view)
+    # Cameras
+
+    @property
+    def camera(self) -> SceneCamera:
+        """The first camera."""
+        return self.cameras[0]
+
+    @property
+    def intrinsics(self) -> Camera:
+        """The first camera's lens, for other environments.
+
+        Raises:
+            InputError: the sensor is no pinhole camera, or its film is cropped.
+        """
+        return self.camera.intrinsics
+
+    @property
+    def mount(self) -> CameraMount:
+        """Pose of the first camera on the vehicle."""
+        return self.camera.mount
+
+    @property
+    def rig(self) -> Rig:
+        """All cameras; InputError as of :attr:`intrinsics`."""
+        lenses = tuple(camera.intrinsics for camera in self.cameras)
+        return Rig(self.names, lenses, tuple(camera.mount for camera in self.cameras))
+
+    def with_rig(self, rig: Rig) -> SceneSensor:
+        """Return this sensor with all cameras of a vehicle.
+
+        The first one is this sensor's, whose lens stays as it is. The others have its
+        clip distances and samples per pixel, and random numbers of their own.
+
+        Args:
+            rig: names, mounts, and the lenses of all cameras but the first.
+        """
+        cameras = [self.camera.changed(mount=rig.mounts[0])]
+        pairs = zip(rig.cameras[1:], rig.mounts[1:], strict=True)
+        for index, (lens, mount) in enumerate(pairs, start=1):
+            cameras.append(self.camera.another(lens, mount, index))
+        return self._with(rig.names, cameras)
+
+    def seeing_as(
+        self, other: SceneSensor, mounts: Sequence[CameraMount] = ()
+    ) -> SceneSensor:
+        """Return this sensor with the cameras of another one, and all their draws.
+
+        Args:
+            other: sees another scene, or other objects.
+            mounts: poses of the cameras on the vehicle, if others.
+        """
+        cameras = other.cameras
+        if mounts:
+            pairs = zip(cameras, mounts, strict=True)
+            cameras = [camera.changed(mount=mount) for camera, mount in pairs]
+        return self._with(other.names, cameras).drawing_as(other)
+
+    def through(self, index: int) -> SceneSensor:
+        """Return this sensor with one of its cameras alone."""
+        result = self._with(self.names[index : index + 1], [self.cameras[index]])
+        if index:
+            result._counter = [0]  # frames are counted by their first image
+        return result
+
+    @property
+    def layout(self) -> Layout | None:
+        """See :attr:`AbstractSensor.layout`."""
+        return self._layout if len(self.cameras) > 1 else None
+
+    @property
+    def _layout(self) -> Layout:
+        return Layout(tuple(camera.size for camera in self.cameras))
 
     # Parameters
 
@@ -304,28 +320,6 @@ class SceneSensor(AbstractDifferentiableSensor):
         """All fields that a `field_integrator` shows, objects among them."""
         return list(getattr(self.integrator, "posed", []))
 
-    @property
-    def intrinsics(self) -> Camera:
-        """The lens, for other environments.
-
-        Raises:
-            InputError: the sensor is no pinhole camera, or its film is cropped.
-        """
-        name = self.camera.sensor.id()
-        if self.camera.sensor.needs_aperture_sample():
-            raise InputError(f"sensor {name!r}: has an aperture; use perspective")
-        found, _ = from_mitsuba(self.camera.sensor)
-        if self.camera.size != (found.width, found.height):
-            raise InputError(
-                f"sensor {name!r}: its film has a crop window; remove crop_* from it"
-            )
-        return found
-
-    @property
-    def mount(self) -> CameraMount:
-        """Pose of the camera on the vehicle."""
-        return self.camera.mount
-
     def textures(self) -> list[Any]:
         """See :meth:`AbstractDifferentiableSensor.textures`."""
         return [field.texture for field in self.fields]
@@ -342,32 +336,4 @@ class SceneSensor(AbstractDifferentiableSensor):
 
     def check_attached(self) -> None:
         """Raise InputError where images have no derivative by the state."""
-        if self._collector is None:
-            raise InputError(
-                f"attached: {type(self.integrator).__name__} has no derivative by the "
-                "camera; set attached to false, or show fields by a field_integrator"
-            )
-        self._collector.check_camera(self.scene)
-
-
-def _sensor_of(scene: mi.Scene, index: int) -> mi.Sensor:
-    count = len(scene.sensors())
-    if not 0 <= index < count:
-        raise InputError(f"sensor: {index}; the scene has {count}, from 0 on")
-    return scene.sensors()[index]
-
-
-def _develop(linear: mi.Color3f) -> mi.Color3f:
-    return dr.linear_to_srgb(linear)
-
-
-def pose_of(state: Any) -> Any:
-    """Return the rows px, py, theta of a state, (3, n), detached."""
-    kind = dr.float64_array_t(mi.Vector3f)
-    return kind(*[dr.detach(state[i]) for i in range(3)])
-
-
-def _colours(image: Any) -> mi.Color3f:
-    """Return the pixels of an image (n, height, width, 3) as (3, n height width)."""
-    index = dr.arange(mi.UInt32, dr.width(image.array) // 3)
-    return dr.gather(mi.Color3f, image.array, index)
+        self._images.check_attached()

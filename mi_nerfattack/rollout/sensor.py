@@ -10,6 +10,7 @@ from typing import Any
 from typing_extensions import Self
 
 from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.render.camera.rig import Layout
 from mi_nerfattack.render.posed import PosedField
 
 
@@ -21,9 +22,10 @@ class Observation:
         image: tensor (n, height, width, 3), sRGB in [0, 1], evaluated.
         step: index of the control period.
         linear: (3, n height width), before the sRGB curve; None where the sensor has
-            no derivatives.
+            no derivatives, and where the frame has parts.
         kept: what the scene's integrator hands to its derivatives.
         view: rays and their weights.
+        parts: what each of several cameras saw, side by side in the image.
     """
 
     image: Any
@@ -31,6 +33,7 @@ class Observation:
     linear: Any = None
     kept: Any = None
     view: Any = None
+    parts: tuple[Observation, ...] = ()
 
     def __repr__(self) -> str:
         count, height, width, _ = self.image.shape
@@ -49,6 +52,11 @@ class AbstractSensor(ABC):
                 as a constant.
             step: index of the control period, from 0; seeds what is random.
         """
+
+    @property
+    def layout(self) -> Layout | None:
+        """Where the images of several cameras lie in a frame; None for one camera."""
+        return None
 
     def numbered(self, first: int) -> Self:
         """Return this sensor with another number of the first drive of each batch.

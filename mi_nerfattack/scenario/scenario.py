@@ -19,11 +19,12 @@ from pydantic import Field, ValidationError, model_validator
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
-from mi_nerfattack.io.overrides import set_keys
+from mi_nerfattack.io.overrides import set_keys, tell
 from mi_nerfattack.io.strict import parse_toml
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.ranges import Count, Finite, Fraction, NonNegative, Positive, Whole
 from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.render.march import STOP
 from mi_nerfattack.scenario.attack import AttackSection
 from mi_nerfattack.scenario.deployment import (
@@ -38,11 +39,12 @@ from mi_nerfattack.scenario.objects import FieldObjectSection, ObjectSection, Tr
 from mi_nerfattack.scenario.policy.kinds import PolicySection, build_differentiable
 from mi_nerfattack.scenario.section import (
     CameraSection,
+    NamedCameraSection,
     Section,
     misfit,
     problems,
     refuse,
-    tell,
+    rig_of,
 )
 from mi_nerfattack.scenario.upgrade import new_lines
 from mi_nerfattack.scenario.vehicle import DubinsSection, VehicleSection
@@ -193,6 +195,7 @@ class Scenario(Section):
     objects: Annotated[tuple[ObjectSection, ...], Field(min_length=1)]
     policy: PolicySection
     camera: CameraSection = CameraSection()
+    cameras: tuple[NamedCameraSection, ...] = ()  # or several
     vehicle: VehicleSection = DubinsSection()
     drive: DriveSection = DriveSection()
     objective: ObjectiveSection = ObjectiveSection()
@@ -207,6 +210,10 @@ class Scenario(Section):
             f"{self.attack.method.kind} attack)"
         )
 
+    def rig(self) -> Rig:
+        """Make the cameras on the vehicle."""
+        return rig_of(self.cameras) if self.cameras else self.camera.rig()
+
     def build_policy(self) -> AbstractPolicy:
         """Make the policy under test.
 
@@ -215,8 +222,8 @@ class Scenario(Section):
                 which it does not have.
         """
         if self.attack.method.needs_derivatives:
-            return build_differentiable(self.policy)
-        return self.policy.build()
+            return build_differentiable(self.policy, self.rig().views)
+        return self.policy.build(self.rig().views)
 
     @model_validator(mode="after")
     def _check_sections(self) -> Any:
@@ -228,6 +235,7 @@ class Scenario(Section):
                 f"ids {names}; must differ, and not be names of other layers of a "
                 "frame: scene, scene1, ..., background, cost, input",
             )
+        self._check_cameras()
         if self.scene.surrogate is None:
             self._check_placed()
         else:
@@ -253,6 +261,17 @@ class Scenario(Section):
         if reason := misfit(policy.unit(), taken, policy.source):
             refuse("vehicle.kind", f"{model} {reason}")
         return self
+
+    def _check_cameras(self) -> None:
+        if not self.cameras:
+            return
+        if "camera" in self.model_fields_set:
+            refuse("cameras", "stands beside [camera]; give one of them")
+        if self.scene.surrogate is not None:
+            refuse("cameras", f"{self.scene.surrogate} has one sensor; give [camera]")
+        names = [camera.name for camera in self.cameras]
+        if len(set(names)) != len(names):
+            refuse("cameras", f"names {names}; must differ")
 
     def _check_placed(self) -> None:
         for index, item in enumerate(self.objects):

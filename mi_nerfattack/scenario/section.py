@@ -8,7 +8,7 @@ a real car reads it, too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, is_dataclass, replace
 from inspect import signature
 from pathlib import Path
@@ -23,7 +23,6 @@ from typing import (
     get_type_hints,
 )
 
-import tomlkit
 from pydantic import (
     BaseModel,
     ConfigDict,
@@ -45,17 +44,18 @@ from pydantic_core import (
     PydanticCustomError,
     core_schema,
 )
-from tomlkit.container import OutOfOrderTableProxy
-from tomlkit.items import AoT, Table
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.io.overrides import find_setting
 from mi_nerfattack.ranges import Count, Finite, Positive
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
+from mi_nerfattack.render.camera.rig import Rig
 
 Trust = Annotated[bool, Field(exclude=True)]  # results do not depend on it
+
+
 #: Of a control: a heading rate, a steering angle, or another quantity.
 Unit = Literal["rad/s", "rad", "other"]
+Turn = Annotated[float, Field(ge=-180, le=180)]  # of a camera, degrees
 
 #: Keys and indices that lead to a value of the file.
 Location = tuple[str | int, ...]
@@ -63,9 +63,6 @@ Location = tuple[str | int, ...]
 _WORDS = {"tuple_type": "must be an array", "model_type": "must be a table"}
 _UNKNOWN = ("unknown", "unexpected_keyword_argument")
 _WORDS |= {"model_attributes_type": "must be a table", "missing": "is missing"}
-
-_MARK = "a line that no file has"
-_MOST_PROBLEMS = 8  # that are told
 
 
 class Section(BaseModel):
@@ -285,65 +282,6 @@ def _frozen(value: Any) -> Any:
     return tuple(map(_frozen, value)) if isinstance(value, list) else value
 
 
-def tell(
-    path: str | Path,
-    text: str,
-    found: Iterable[tuple[Location, str]],
-    settings: Sequence[str] = (),
-) -> str:
-    """Tell problems of a file, each with its line and key; of many, the first.
-
-    Args:
-        path: the file.
-        text: its content, valid TOML.
-        found: keys that lead to each problem, and what is wrong.
-        settings: of the command line, see `overrides.set_keys`; a problem of one of
-            them is told with the setting in place of a line.
-    """
-    found, lines = list(found), []
-    for location, problem in found[:_MOST_PROBLEMS]:
-        if setting := find_setting(settings, location):
-            where = f"--set {setting}"
-        else:
-            line = _line_of(text, location)
-            where = f"{path}:{line}" if line else f"{path}"
-        key = ".".join(map(str, location))
-        lines.append(f"{where}: {key}: {problem}")
-    if more := len(found) - len(lines):
-        lines.append(f"{path}: and {more} more")
-    return "\n".join(lines)
-
-
-def _line_of(text: str, location: Location) -> int | None:
-    """Find the line of a key, or of the table that lacks it; 1-based.
-
-    Of a table without a header, such as dotted keys make, it is that of its first key.
-    """
-    document = tomlkit.parse(text)
-    item: Any = document
-    holder: Any = None
-    key: Any = None
-    for part in location:
-        inner = item.get(part) if isinstance(part, str) else item[part]
-        if inner is None:
-            break
-        holder, key, item = item, part, inner
-        if not isinstance(inner, Table | AoT | OutOfOrderTableProxy):
-            break  # a value, or an inline table
-    if holder is None:
-        return None
-    while isinstance(item, AoT | OutOfOrderTableProxy) or (
-        isinstance(item, Table) and item.is_super_table()
-    ):
-        holder, key = item, 0 if isinstance(item, AoT) else next(iter(item))
-        item = holder[key]
-    if isinstance(item, Table):
-        item.comment(_MARK)
-    else:
-        holder[key] = _MARK
-    return tomlkit.dumps(document).partition(_MARK)[0].count("\n") + 1
-
-
 def misfit(given: str | None, taken: str | None, source: str) -> str:
     """Say why a vehicle does not take a policy's control; nothing if it may.
 
@@ -360,8 +298,8 @@ def misfit(given: str | None, taken: str | None, source: str) -> str:
     )
 
 
-class CameraSection(Section):
-    """The camera on the vehicle."""
+class AbstractCameraSection(Section):
+    """A camera on the vehicle."""
 
     width: Count = 200
     height: Count = 66
@@ -377,6 +315,9 @@ class CameraSection(Section):
     height_m: Positive = 1.4
     forward_m: Finite = 0.5
     pitch_deg: Annotated[float, Field(gt=-90, lt=90)] = 6.0
+    left_m: Finite = 0.0
+    yaw_deg: Turn = 0.0  # to the left
+    later: ClassVar[tuple[str, ...]] = ("left_m", "yaw_deg")
     lens: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
     def build(self) -> tuple[Camera, CameraMount]:
@@ -384,7 +325,8 @@ class CameraSection(Section):
         camera = from_fov(self.width, self.height, self.fov_x_deg)
         lens = {k: getattr(self, k) for k in self.lens} | {"fy": self.fy or self.fx}
         camera = replace(camera, **{k: v for k, v in lens.items() if v is not None})
-        return camera, CameraMount(self.height_m, self.forward_m, self.pitch_deg)
+        names = ("height_m", "forward_m", "pitch_deg", "left_m", "yaw_deg")
+        return camera, CameraMount(**{name: getattr(self, name) for name in names})
 
     @model_validator(mode="after")
     def _check_lens(self) -> Any:
@@ -398,3 +340,32 @@ class CameraSection(Section):
         except InputError as error:
             refuse("k1", str(error))
         return self
+
+
+class CameraSection(AbstractCameraSection):
+    """The only camera on the vehicle."""
+
+    def rig(self) -> Rig:
+        """Make what a vehicle with this camera sees by."""
+        return Rig.of_one(*self.build())
+
+
+class NamedCameraSection(AbstractCameraSection):
+    """One of several cameras, of which the first is what a drive is checked by."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,19}$")]
+
+
+#: The tables [[cameras]].
+CameraSections = Annotated[tuple[NamedCameraSection, ...], Field(min_length=1)]
+
+
+def rig_of(cameras: Sequence[NamedCameraSection]) -> Rig:
+    """Make what a vehicle with several cameras sees by.
+
+    Raises:
+        InputError: two have one name.
+    """
+    names = tuple(camera.name for camera in cameras)
+    lenses, mounts = zip(*(camera.build() for camera in cameras), strict=True)
+    return Rig(names, lenses, mounts)

@@ -25,7 +25,7 @@ from mi_nerfattack.fields.io import holds_splats
 from mi_nerfattack.io.resumable import array_digest
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.render.backdrop import Layer
-from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.render.posed import PosedField, move_all, offsets_of
 from mi_nerfattack.render.splatting.background import SplatBackground
@@ -190,7 +190,7 @@ def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
     motion = scenario.vehicle.motion()
     route = driven_route(scenario, motion)
     objective = scenario.objective.build(scenario, route, motion.dynamics)
-    where = place_of(scenario, surrogate.intrinsics, motion)
+    where = place_of(scenario, surrogate.rig, motion)
     return World(
         scenario,
         route,
@@ -206,25 +206,26 @@ def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
     )
 
 
-def place_of(scenario: Scenario, camera: Camera, motion: Motion) -> Place:
+def place_of(scenario: Scenario, rig: Rig, motion: Motion) -> Place:
     """Describe where a scenario is driven, without the scene's field.
 
     Args:
         scenario: names the files.
-        camera: of the vehicle; a Mitsuba scene of the surrogate may bring its own.
+        rig: cameras; a Mitsuba scene of the surrogate may bring its own.
         motion: of the vehicle.
     """
-    _, mount = scenario.camera.build()
     return Place(
         scene=scenario.scene.deployment.file,
         field=None,
         routes=scenario.scene.routes.file,
         objects=(),
-        camera=camera,
-        mount=mount,
+        camera=rig.cameras[0],
+        mount=rig.mounts[0],
         period=scenario.vehicle.dt_s,
         car=scenario.vehicle.car(),
         motion=motion,
+        camera_name=rig.names[0],
+        others=rig.others,
     )
 
 
@@ -269,11 +270,11 @@ def build_surrogate(scenario: Scenario) -> SceneSensor:
         InputError: a file is missing or wrong, or its scene has no derivative that
             the scenario asks for.
     """
-    place, (camera, mount) = scenario.scene, scenario.camera.build()
+    place, rig = scenario.scene, scenario.rig()
     names = [item.id for item in scenario.objects]
     if place.surrogate is not None:
         xml = load_scene(place.surrogate.file)
-        sensor = scene_sensor(xml, mount, names, scenario.seed)
+        sensor = scene_sensor(xml, rig.mounts[0], names, scenario.seed)
         if scenario.attack.attached:
             try:
                 sensor.check_attached()
@@ -288,7 +289,8 @@ def build_surrogate(scenario: Scenario) -> SceneSensor:
     look = jitter, place.stop, place.composite, names
     assert place.field is not None  # checked by SceneSection
     scene = _load_layer(scenario, place.field.file)
-    sensor = field_sensor(scene, posed, camera, mount, *look, spp=place.spp)
+    first = rig.cameras[0], rig.mounts[0]
+    sensor = field_sensor(scene, posed, *first, *look, spp=place.spp).with_rig(rig)
     if scenario.attack.attached:
         _require_smooth(sensor, "scene.spp")
     return sensor

@@ -361,10 +361,10 @@ def _check_places(
 def check_camera(site: AbstractSite) -> None:
     """Raise `InputError` unless PilotNet takes the images of a site's camera."""
     height, width = IMAGE_SHAPE
-    camera = site.camera
-    if (camera.width, camera.height) != (width, height):
+    if site.rig.size != (width, height):
+        wide, high = site.rig.size
         raise InputError(
-            f"camera of {site.name!r}: {camera.width} x {camera.height} px; PilotNet "
+            f"camera of {site.name!r}: {wide} x {high} px; PilotNet "
             f"takes {width} x {height}: change the camera, or collect frames alone "
             "('mi-nerfattack train --frames-only') and train your own network"
         )

@@ -335,4 +335,4 @@ def test_set_keys_come_before_those_of_the_file():
     assert file.vehicle is not None and file.vehicle.width_m == 0.25
     own = PolicyFile.read("mine.pt2", ["policy.kind=exported", "camera.width=80"])
     assert own.policy is not None and own.policy.kind == "exported"
-    assert own.camera is not None and own.camera[0].width == 80
+    assert own.rig is not None and own.rig.size[0] == 80

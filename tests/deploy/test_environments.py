@@ -31,6 +31,7 @@ from mi_nerfattack.deploy.views.mitsuba import MitsubaView
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov, look_at
 from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.render.pathtrace.load import DAYLIGHT, set_daylight
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.vehicle.dynamics import Dubins, to_state
@@ -99,7 +100,7 @@ def test_every_frame_has_a_seed_of_its_own_that_follows_from_the_drives():
         environment = blank_environment()
         environment.reset(a_route(), None, drive)
         environment.step(0.0)
-        seeds.append(environment.view.seeds)
+        seeds.append(environment.views[0].seeds)
     assert seeds[0] == seeds[1] and len({*seeds[0], *seeds[2]}) == 4
 
 
@@ -246,6 +247,7 @@ def sky(scene, name="noon"):
 
 TIMED = '<scene version="3.0.0"><emitter type="sunsky"/></scene>'
 BUILT, NOISY = Conditions(built_in=(object(),)), Conditions(noise_sd=0.1)
+LEFT = Rig.of_one(CAMERA, CameraMount(yaw_deg=60.0), "left")
 HERE, NONE = {"recording": Path()}, Path("none.xml")
 test_refused = refusals(
     (step(0.0, begun=False), "'blank': step comes after reset"),
@@ -266,6 +268,8 @@ test_refused = refusals(
     (made("surrogate", BUILT), "'surrogate': .*built-in"),
     (made("replay", BUILT, **HERE), "'replay': .*built-in"),
     (made("carla", NOISY), "'carla': .*blur_px"),
+    (made("carla", others=LEFT), r"'carla': .* 2 \(camera, left\)"),
+    (made("replay", others=LEFT, **HERE), "'replay': takes one camera"),
     (made("replay", NOISY, **HERE), "'replay': .*blur_px"),
     (made("mitsuba", scene=NONE), "none.xml: does not exist"),
     (sky(WALL), "'noon' .*`sunsky`"),

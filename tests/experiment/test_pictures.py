@@ -27,6 +27,7 @@ from mi_nerfattack.io import files
 from mi_nerfattack.io.exr import read_layers, read_metadata
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
+from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.report.plots.strip import GAP_PX, TILE_PX
 from mi_nerfattack.rollout.drive import CASES, Drive
 from mi_nerfattack.rollout.objective import StateHistory
@@ -219,7 +220,7 @@ def test_an_input_of_another_size_has_a_file_of_its_own(tmp_path):
     camera, image = from_fov(8, 6, 90.0), np.zeros((6, 8, 3), np.uint8)
     frame = CameraFrame(image, np.ones((6, 8), np.float32), np.eye(4))
     plane = np.arange(20, dtype=np.float32).reshape(4, 5)
-    folder = FrameFolder(tmp_path, camera)
+    folder = FrameFolder(tmp_path, Rig.of_one(camera, CameraMount()))
     # frames of an earlier run are removed, and nothing else
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
     layers = frame.layers([]) | {"input.0": plane}

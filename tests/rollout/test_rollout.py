@@ -236,7 +236,7 @@ def test_another_mount_makes_another_image():
     state = loop.initial(INITIAL)
     before = loop.sensor.observe(state, 0).image.numpy().copy()
     mount = CameraMount(height_m=1.6, forward_m=0.3, pitch_deg=4.0)
-    other = showing(loop.sensor, loop.sensor.objects, mount=mount)
+    other = showing(loop.sensor, loop.sensor.objects, mounts=[mount])
     assert np.abs(other.observe(state, 0).image.numpy() - before).max() > 0.01
 
 
@@ -266,7 +266,7 @@ def test_kept_frames_are_not_rendered_again():
     rollout = make_rollout(loop, 3, adjoint="kept")
     evaluation = rollout.run(loop.initial(INITIAL))
     kept = evaluation.trajectory.kept
-    marches = [march for state, _ in kept for march in state.seen]
+    marches = [march for (state,), _ in kept for march in state.seen]
     arrays = [(*march.radiance, march.opacity, march.moment) for march in marches]
     floats = sum(dr.width(array) for parts in arrays for array in parts)
     assert 4 * floats == 3 * toy.WIDTH * toy.HEIGHT * 2 * 20  # as its docstring says

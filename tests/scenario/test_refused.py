@@ -22,6 +22,12 @@ name = "test" -> attack.method.max_iterations = 0; name = "a" => :1: attack.meth
 [camera]; fy = 200 => camera.fy: .*without fx
 [camera]; fx = 0 => camera.fx: .*greater
 [camera]; k1 = -3 => camera.k1: .*folds
+[camera]; yaw_deg = 200 => camera.yaw_deg: .*180
+[camera]; name = "front" => camera.name: unknown key; .*left_m
+[[cameras]]; width = 8 => :13: cameras.0.name: is missing
+[[cameras]]; name = "a b" => :14: cameras.0.name: .*pattern
+[[cameras]]; name = "a"; [camera]; width = 8 => cameras: stands beside .camera.
+[[cameras]]; name = "a"; [[cameras]]; name = "a" => cameras: .*must differ
 [attack.method]; max_iteratons = 3 => :14: attack.method.max_iteratons: .*max_iterations
 [attack.method]; max_iterations = 0 => method.max_iterations: .*0
 [attack.method]; max_iterations = "3" => method.max_iterations: .*integer

@@ -11,7 +11,7 @@ from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
     from mi_nerfattack.deploy.place import Place
-    from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
+    from mi_nerfattack.render.camera.rig import Rig
     from mi_nerfattack.scenario.policy.base import AbstractPolicySection
     from mi_nerfattack.scenario.scenario import Scenario
     from mi_nerfattack.scenario.vehicle import AbstractVehicleSection
@@ -27,16 +27,21 @@ class PolicyFile:
     Attributes:
         name: for messages.
         policy: the section [policy], if there is one.
-        camera: of the section [camera].
+        rig: of the section [camera], or of [[cameras]].
         vehicle: the section [vehicle].
         scenario: all of it, where there is a section [scene].
     """
 
     name: str
     policy: AbstractPolicySection | None = None
-    camera: tuple[Camera, CameraMount] | None = None
+    rig: Rig | None = None
     vehicle: AbstractVehicleSection | None = None
     scenario: Scenario | None = None
+
+    @property
+    def views(self) -> dict[str, tuple[slice, slice]]:
+        """Rows and columns of the cameras' images in a frame, see `Rig.views`."""
+        return {} if self.rig is None else self.rig.views
 
     @classmethod
     def read(cls, policy: str | None, settings: Sequence[str] = ()) -> PolicyFile:
@@ -53,19 +58,25 @@ class PolicyFile:
         """
         from mi_nerfattack.scenario.policy.kinds import PolicySection
         from mi_nerfattack.scenario.scenario import load_scenario
-        from mi_nerfattack.scenario.section import CameraSection, read_section
+        from mi_nerfattack.scenario.section import (
+            CameraSection,
+            CameraSections,
+            read_section,
+            rig_of,
+        )
         from mi_nerfattack.scenario.vehicle import VehicleSection
 
         name = policy or BUNDLED_POLICY
         path, folder, values = _read_values(name, settings)
         if "scene" in values and "policy" in values:
             scenario, _ = load_scenario(path, settings=settings)
-            camera, vehicle = scenario.camera.build(), scenario.vehicle
-            return cls(name, scenario.policy, camera, vehicle, scenario)
+            rig, vehicle = scenario.rig(), scenario.vehicle
+            return cls(name, scenario.policy, rig, vehicle, scenario)
         found: dict[str, Any] = {}
         for key, kind in (
             ("policy", PolicySection),
             ("camera", CameraSection),
+            ("cameras", CameraSections),
             ("vehicle", VehicleSection),
         ):
             if key in values:
@@ -74,12 +85,18 @@ class PolicyFile:
         if found and values and "scene" not in values:
             raise InputError(
                 f"{name}: {', '.join(values)}: has no effect without [scene]; allowed: "
-                "policy, camera, vehicle"
+                "policy, camera or cameras, vehicle"
             )
-        camera = found.get("camera")
-        return cls(
-            name, found.get("policy"), camera and camera.build(), found.get("vehicle")
-        )
+        if {"camera", "cameras"} <= set(found):
+            raise InputError(
+                f"{name}: cameras: stands beside [camera]; give one of them"
+            )
+        rig = None
+        if "camera" in found:
+            rig = found["camera"].rig()
+        elif "cameras" in found:
+            rig = rig_of(found["cameras"])
+        return cls(name, found.get("policy"), rig, found.get("vehicle"))
 
     @property
     def section(self) -> AbstractPolicySection:
@@ -154,8 +171,8 @@ class PolicyFile:
                 routes=scene.routes.file,
                 objects=tuple(self._object_files()),
             )
-        if self.camera is not None:
-            place = replace(place, camera=self.camera[0], mount=self.camera[1])
+        if self.rig is not None:
+            place = place.with_rig(self.rig)
         if self.vehicle is not None:
             car, period = self.vehicle.car(), self.vehicle.dt_s
             place = replace(place, car=car, period=period)
@@ -178,7 +195,7 @@ class PolicyFile:
             yield item.named.file
 
 
-def read_camera(name: str) -> tuple[Camera, CameraMount]:
+def read_camera(name: str) -> Rig:
     """Read [camera] alone: a car's computer has no code for other sections.
 
     Raises:
@@ -187,10 +204,12 @@ def read_camera(name: str) -> tuple[Camera, CameraMount]:
     from mi_nerfattack.scenario.section import CameraSection, read_section
 
     _, folder, values = _read_values(name)
+    if "cameras" in values:
+        raise InputError(f"{name}: cameras: several; the car has one: give [camera]")
     if not {"camera", "scene"} & set(values):
         raise InputError(f"{name}: has no section [camera]")
     where, camera = f"{name}: camera", values.get("camera", {})
-    return read_section(where, CameraSection, camera, folder).build()
+    return read_section(where, CameraSection, camera, folder).rig()
 
 
 def _read_values(

@@ -30,6 +30,7 @@ from mi_nerfattack.render.camera.intrinsics import (
     camera_to_body,
     planar_body,
 )
+from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.vehicle.route.route import Route
 
 VEHICLE = "vehicle.tesla.model3"
@@ -77,6 +78,7 @@ class CarlaEnvironment(AbstractEnvironment):
     ) -> None:
         field_of_view_deg(camera)
         self.camera, self.period, self.driver = camera, period, driver
+        self.rig = Rig.of_one(camera, mount)
         self.max_control = driver.max_control
         self.control_unit = driver.control_unit
         self._vehicle, self._axles = vehicle, axles

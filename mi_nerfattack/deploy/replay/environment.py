@@ -20,6 +20,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.io.video import VIDEO_SUFFIXES
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
+from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.vehicle.route.route import Route
 
 
@@ -55,6 +56,7 @@ class ReplayEnvironment(AbstractEnvironment):
         if not 0 < period < math.inf:
             raise InputError(f"period: {period}; a positive time, seconds")
         self.recording, self.camera = recording, recording.camera
+        self.rig = Rig.of_one(recording.camera, mount)
         self.period, self.max_control = period, max_control
         self.control_unit = control_unit
         self.controls: list[float] = []

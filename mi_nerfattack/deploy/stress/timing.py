@@ -30,6 +30,7 @@ class AbstractAround(AbstractEnvironment):
 
     def __init__(self, inside: AbstractEnvironment) -> None:
         self.inside, self.name, self.camera = inside, inside.name, inside.camera
+        self.rig = inside.rig
         self.period, self.max_control = inside.period, inside.max_control
         self.control_unit = inside.control_unit
 

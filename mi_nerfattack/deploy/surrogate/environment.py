@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.deploy.environment import CameraFrame
+from mi_nerfattack.deploy.environment import CameraFrame, join_frames
 from mi_nerfattack.deploy.simulated import AbstractSimulation
 from mi_nerfattack.deploy.surrogate.scene import showing
 from mi_nerfattack.deploy.vehicle import KinematicVehicle
@@ -19,7 +19,8 @@ from mi_nerfattack.deploy.views.paste import OPAQUE, require_fields
 from mi_nerfattack.render.camera.intrinsics import mount_matrix
 from mi_nerfattack.render.rays import March
 from mi_nerfattack.render.scene_march import nearest_surface
-from mi_nerfattack.rollout.scene_sensor import SceneSensor, pose_of
+from mi_nerfattack.rollout.camera import pose_of
+from mi_nerfattack.rollout.scene_sensor import SceneSensor
 from mi_nerfattack.rollout.sensor import Observation
 from mi_nerfattack.vehicle.dynamics import to_state
 
@@ -110,12 +111,12 @@ class SurrogateEnvironment(AbstractSimulation):
     a ray meets, infinite where it meets less than half an opacity.
 
     Args:
-        sensor: sees.
+        sensor: sees, by one camera or several.
         vehicle: moves.
     """
 
     def __init__(self, sensor: SceneSensor, vehicle: KinematicVehicle) -> None:
-        super().__init__("surrogate", vehicle, sensor.intrinsics, vehicle.period)
+        super().__init__("surrogate", vehicle, sensor.rig, vehicle.period)
         self.sensor = sensor
 
     def show(self, objects: Sequence[Any]) -> None:
@@ -127,12 +128,17 @@ class SurrogateEnvironment(AbstractSimulation):
         """Nothing is held."""
 
     def _observe(self) -> CameraFrame:
-        sensor, state = self.sensor, to_state(self.state[None])
+        eyes = [self.sensor.through(k) for k in range(len(self.sensor.cameras))]
+        return join_frames([self._frame(eye) for eye in eyes], self.rig.layout)
+
+    def _frame(self, sensor: SceneSensor) -> CameraFrame:
+        """Return the frame of one of the cameras."""
+        state = to_state(self.state[None])
         found = sensor.observe(state, self._steps)
         distances = measure(sensor, found, state)
         total = total_of(sensor, found, distances.start)
         depth = dr.select(total.opacity >= OPAQUE, total.depth, distances.far)
-        shape = (self.camera.height, self.camera.width)
+        shape = found.image.shape[1:3]
         shown = [id(layer) for layer in sensor.layers]
         can_split = all(id(posed) in shown for posed in sensor.objects)
         return CameraFrame(

@@ -86,16 +86,16 @@ def showing(
     sensor: SceneSensor,
     objects: Sequence[PosedField],
     scene: Layer | None = None,
-    mount: CameraMount | None = None,
+    mounts: Sequence[CameraMount] = (),
 ) -> SceneSensor:
-    """Return a camera like another one that shows other objects, or another scene.
+    """Return a sensor like another one that shows other objects, or another scene.
 
     Args:
         sensor: sees a scene by a `field_integrator`; what it differentiates by counts
             as its objects.
         objects: grid fields.
         scene: in the place of its other fields.
-        mount: pose on the vehicle, if another one.
+        mounts: poses of the cameras on the vehicle, if others.
 
     Raises:
         InputError: another integrator, or shapes that no other scene can share.
@@ -122,11 +122,9 @@ def showing(
     result = _see(
         Shown(others, shown, integrator.behind, {"composite": rule, **options}),
         [camera.sensor, *parts],
-        mount=mount or camera.mount,
-        seed=camera.seed,
         centred=camera.centred,
     )
-    return result.drawing_as(sensor)
+    return result.seeing_as(sensor, mounts)
 
 
 def scene_sensor(

@@ -259,7 +259,7 @@ def view_findings(world: World, first: Drive) -> Iterator[str]:
 def changeable_share(
     world: World, fields: Sequence[GridField], pose: np.ndarray, step: int
 ) -> float:
-    """Return the share of the pixels that the textures of objects can change.
+    """Return the share of the first camera's pixels that textures can change.
 
     Args:
         world: of the attack; the fields keep another texture.
@@ -267,7 +267,7 @@ def changeable_share(
         pose: (3,) of the vehicle.
         step: control period, of the rays.
     """
-    sensor, state = world.surrogate, to_state(pose[None])
+    sensor, state = world.surrogate.through(0), to_state(pose[None])
     images = []
     for raw in (_RAW, -_RAW):
         for field in fields:

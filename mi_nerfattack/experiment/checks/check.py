@@ -17,6 +17,7 @@ from mi_nerfattack.deploy.environment import (
     CameraFrame,
     OpenEnvironment,
     drive,
+    first_frame,
     policy_image,
 )
 from mi_nerfattack.deploy.views.above import scene_above, surrogate_above
@@ -103,8 +104,9 @@ class Check:
             self._told(lambda: self._slope(base))
         for label, frame in self.frames.items():
             if label != SURROGATE and base is not None:
-                camera = world.surrogate.intrinsics
-                found = likeness_findings(camera, base, frame, label)
+                camera, layout = world.surrogate.intrinsics, world.place.rig.layout
+                pair = first_frame(base, layout), first_frame(frame, layout)
+                found = likeness_findings(camera, *pair, label)
                 self.doubts += found
 
     def _slope(self, frame: CameraFrame) -> None:
@@ -213,7 +215,9 @@ class Check:
         grounds = {"Surrogate, from above": surrogate_above(world.surrogate, overhead)}
         looks = {
             f"First image in {label}": Look(
-                frame.image, world.surrogate.intrinsics, frame.camera_to_world
+                first_frame(frame, world.place.rig.layout).image,
+                world.surrogate.intrinsics,
+                frame.camera_to_world,
             )
             for label, frame in list(self.frames.items())[:2]
         }

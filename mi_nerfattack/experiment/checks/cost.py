@@ -162,6 +162,5 @@ def _kept_mb(world: World) -> float:
         kept += _BEHIND_BYTES
     if section.vary.light_ev_sd or section.vary.light_colour_ev_sd:
         kept += _LIGHT_BYTES
-    width, height = sensor.camera.size
-    samples = width * height * sensor.camera.spp * section.poses
+    samples = section.poses * sum(camera.per_image for camera in sensor.cameras)
     return kept * samples * max(0, world.horizon - _PERIODS) / 1e6

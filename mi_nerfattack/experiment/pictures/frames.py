@@ -27,7 +27,7 @@ from mi_nerfattack.evaluation.metrics import environment_order
 from mi_nerfattack.experiment.cases import OnProgress
 from mi_nerfattack.experiment.finished import Finished, Frames
 from mi_nerfattack.io import exr, files
-from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.render.pathtrace.views import describe_lens, frame_metadata
 from mi_nerfattack.report.plots.strip import aligned_steps, first_person_strip
 from mi_nerfattack.rollout.drive import CASES, Drive
@@ -44,15 +44,16 @@ class FrameFolder:
     """A folder that frames are written to, each as ``STEP.exr`` and ``STEP.png``.
 
     With ``transforms.json`` and ``depth.safetensors``, which :meth:`finish` writes, it
-    is a recording for the environment `replay`. What an earlier run left is removed.
+    is a recording for the environment `replay`; frames of several cameras are none.
+    What an earlier run left is removed.
 
     Args:
         path: of the folder; made.
-        camera: intrinsics of all frames.
+        rig: cameras of all frames.
     """
 
-    def __init__(self, path: Path, camera: Camera) -> None:
-        self.path, self.camera = files.make_folder(path), camera
+    def __init__(self, path: Path, rig: Rig) -> None:
+        self.path, self.rig = files.make_folder(path), rig
         for found in list(self.path.iterdir()):
             if _OURS.fullmatch(found.name):
                 found.unlink()
@@ -96,12 +97,14 @@ class FrameFolder:
 
     def finish(self) -> None:
         """Write what makes a recording of the frames, poses and times last."""
+        if self.rig.others is not None:
+            return
         depth = np.stack(self._depths).astype(np.float32)
         files.write_safetensors(self.path / "depth.safetensors", {"depth": depth}, {})
         write_poses(
             self.path / "transforms.json",
             self._names,
-            self.camera,
+            self.rig.cameras[0],
             np.stack(self._poses),
             {"units": "metre", "depth_file": "depth.safetensors"},
             self._times,
@@ -179,7 +182,7 @@ def write_frames(
         try:
             seen = {**digests, **_digests(world, look)}
             film = Film(world, drive, environment, look is None, seen)
-            folder = FrameFolder(frame_folder(output, drive), environment.camera)
+            folder = FrameFolder(frame_folder(output, drive), environment.rig)
             costs = film.cost_by_image(written)
             for moment in film.moments({*columns, *written}):
                 shown = columns.count(moment.step)
@@ -313,15 +316,16 @@ class Film:
     def describe(self, moment: Moment) -> dict[str, str]:
         """Say what a frame shows; see :func:`frame_metadata`."""
         world, drive, step = self.world, self.drive, moment.step
-        label, state = drive.environment, moment.state
+        label, state, rig = drive.environment, moment.state, self.environment.rig
         return frame_metadata(
-            describe_lens(self.environment.camera),
+            describe_lens(rig.cameras[0]),
             moment.seen.camera_to_world,
             drive.seed,
             world.surrogate.camera.spp
             if label == SURROGATE
             else world.deployments[label].spp,
             self.digests,
+            cameras=None if rig.others is None else rig.described(),
             scenario=world.scenario.name,
             environment=label,
             case=drive.case,

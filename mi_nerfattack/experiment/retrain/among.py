@@ -27,7 +27,7 @@ from mi_nerfattack.vehicle.route.route import Route
 
 #: Parts of a scenario in which all runs must agree: the world, but for its routes.
 _SHARED = ("scene.field", "scene.surrogate", "scene.to_world", "scene.deployment")
-_SHARED += ("scene.routes", "camera", "vehicle")
+_SHARED += ("scene.routes", "camera", "cameras", "vehicle")
 #: Keys that say no more of a policy than its weights.
 _PLAIN = {"kind", "file_sha256"}
 
@@ -134,10 +134,10 @@ def found_place(attacks: Sequence[FoundAttack]) -> Place:
         remedy = f"it is compared with {first.folder}; retrain in one place at a time"
         refuse(found.folder, differences(here, there), remedy)
     scenario = first.scenario
-    scene, (camera, _) = scenario.scene, scenario.camera.build()
+    scene = scenario.scene
     assert scene.field is not None  # checked by SceneSection
     plain = scene.to_world is None and not holds_splats(scene.field.file)
-    place = place_of(scenario, camera, scenario.vehicle.motion())
+    place = place_of(scenario, scenario.rig(), scenario.vehicle.motion())
     return replace(place, field=scene.field.file) if plain else place
 
 

@@ -19,11 +19,12 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.sweep.cell import Cell
 from mi_nerfattack.experiment.sweep.places import DrawSection, Places
 from mi_nerfattack.io import files
+from mi_nerfattack.io.overrides import tell
 from mi_nerfattack.io.strict import parse_toml
 from mi_nerfattack.ranges import Count, NonNegative, Seed
 from mi_nerfattack.scenario.named_file import File, NamedFile, portable_text
 from mi_nerfattack.scenario.scenario import Scenario, load_scenario
-from mi_nerfattack.scenario.section import Location, Section, problems, refuse, tell
+from mi_nerfattack.scenario.section import Location, Section, problems, refuse
 from mi_nerfattack.scenario.upgrade import new_lines
 from mi_nerfattack.scenario.world import judged_frames
 

@@ -73,12 +73,13 @@ class Places:
         Raises:
             InputError: a file is missing or wrong, or no place was found for all.
         """
-        vehicle, scene = scenario.vehicle, scenario.scene
+        vehicle, scene, rig = scenario.vehicle, scenario.scene, scenario.rig()
         route = driven_route(scenario, vehicle.motion())
         around = self._surroundings(
             scene.deployment.file,
             scene.routes.file,
-            *scenario.camera.build(),
+            rig.cameras[0],
+            rig.mounts[0],
             vehicle.dt_s,
         )
         poses = section.rule().draw(

@@ -15,6 +15,7 @@ from mi_nerfattack.deploy.surrogate.environment import SurrogateEnvironment
 from mi_nerfattack.deploy.surrogate.scene import showing
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Finite, NonNegative, Share, Whole, checked
+from mi_nerfattack.render.camera.rig import camera_seed
 from mi_nerfattack.render.pathtrace.load import DAYLIGHT
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.scenario.deployment import SURROGATE, Deployment
@@ -195,11 +196,15 @@ class Column:
             seed: of the drive.
         """
         condition = self.condition
-        mount = condition.errors.mount(world.place.mount, seed)
-        place = replace(world.place, mount=mount)
+        rig, errors = world.place.rig, condition.errors
+        mounts = [
+            errors.mount(mount, camera_seed(seed, index))
+            for index, mount in enumerate(rig.mounts)
+        ]
+        place = world.place.with_rig(rig.on(mounts))
         blur, noise = condition.blur_px, condition.noise_sd
         if self.environment == SURROGATE:
-            sensor = showing(world.surrogate, list(objects), mount=mount)
+            sensor = showing(world.surrogate, list(objects), mounts=mounts)
             found = SurrogateEnvironment(sensor, kinematic_vehicle(place))
             found.blur_px, found.noise_sd = blur, noise
             return condition.around(found)

@@ -174,7 +174,9 @@ class TransferDriver(AbstractDriver):
         if self._world is None or self._number != number:
             self.close()
             found = self._attacks[number]
-            world = build_world(found.scenario, found.scenario.policy.build())
+            scenario = found.scenario
+            policy = scenario.policy.build(scenario.rig().views)
+            world = build_world(scenario, policy)
             self._world, self._number = world, number
             self._looks = found.looks(world)
         return self._world

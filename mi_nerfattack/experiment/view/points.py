@@ -51,7 +51,7 @@ def scene_cloud(
         states: (n, 3) of a drive, metres and radians.
         on_frame: told how many frames are done, of how many.
     """
-    sensor = world.without_objects()
+    sensor = world.without_objects().through(0)
     environment = SurrogateEnvironment(sensor, kinematic_vehicle(world.place))
     rays, parts = PixelRays(sensor.intrinsics), []
     places = _places(states)

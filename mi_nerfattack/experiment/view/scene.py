@@ -176,7 +176,7 @@ class RunScene:
         """Put the camera somewhere, and what it sees before it."""
         self.camera.position = camera_to_world[:3, 3]
         self.camera.wxyz = to_wxyz(camera_to_world[:3, :3])
-        self.camera.image = image
+        self.camera.image = self._viewed.world.place.rig.layout.split(image)[0]
 
     def tell(self, text: str, apart: np.ndarray | None) -> None:
         """Write a line above the camera, and hang a picture there.

@@ -133,8 +133,8 @@ class Viewer:
         self.slider = gui.add_slider("Period", 0, len(drive.controls), 1, 0)
         self.play = gui.add_button("Play")
         self.told = gui.add_markdown("")
-        camera = self.viewed.world.surrogate.intrinsics
-        black = np.zeros((camera.height, camera.width, 3), np.uint8)
+        width, height = self.viewed.world.place.rig.size
+        black = np.zeros((height, width, 3), np.uint8)
         self.seen = gui.add_image(black, label=SEEN, format="png")
         label = "Where the attack acts: difference to the objects' own textures"
         self.apart = gui.add_image(black, label=label, format="png")

@@ -7,7 +7,7 @@ torchvision, whose registry build does not load with the CPU build of torch.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -138,38 +138,41 @@ class OnnxNetwork(torch.nn.Module):
             _input(i) for i in graph.input if i.name not in known
         ]
         self.outputs: list[Any] = [output.name for output in graph.output]
+        self.controls = 1  # of the outputs, those that are joined
         if not self.inputs or not self.inputs[0].sizes:
             raise InputError(f"{name}: has no image among its inputs")
         self.batch: int | None = self.inputs[0].sizes[0]
         self._measured: set[tuple[torch.Size, ...]] = set()
 
-    def choose(self, name: str | None, hidden: int) -> None:
-        """Choose the output that is the control; the hidden states come after it.
+    def choose(self, controls: Sequence[str], hidden: int) -> None:
+        """Choose the outputs that are controls; the hidden states come after them.
 
         Args:
-            name: of the control; None where it is the first of 1 + `hidden` outputs.
+            controls: names; several become the columns of one answer. None where the
+                control is the first of 1 + `hidden` outputs.
             hidden: number of hidden states; without any, other outputs are left out.
 
         Raises:
             InputError: there is no such output, or their number does not fit.
         """
         names = self.outputs
-        if name is None and len(names) == 1 + hidden:
+        if not controls and len(names) == 1 + hidden:
             return
         listed = ", ".join(map(repr, names))
-        if name is None or name not in names:
+        if not controls or not set(controls) <= set(names):
             raise InputError(
                 f"{self.name}: has the outputs {listed}, and policy.output_name is "
-                f"{name!r}: give the name of the control there; policy.recurrent "
-                f"declares {hidden} hidden states"
+                f"{list(controls)}: give the name of the control there, or those of "
+                f"several; policy.recurrent declares {hidden} hidden states"
             )
-        rest = [other for other in names if other != name] if hidden else []
+        rest = [other for other in names if other not in controls] if hidden else []
         if len(rest) != hidden:
             raise InputError(
-                f"{self.name}: has the outputs {listed}; beside the control {name!r} "
-                f"there must be {hidden} hidden states, as policy.recurrent declares"
+                f"{self.name}: has the outputs {listed}; beside the controls "
+                f"{list(controls)} there must be {hidden} hidden states, as "
+                "policy.recurrent declares"
             )
-        self.outputs = [name, *rest]
+        self.outputs, self.controls = [*controls, *rest], len(controls)
 
     def forward(self, *arguments: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Evaluate all nodes; the first time of these sizes, by a budget of memory."""
@@ -197,7 +200,13 @@ class OnnxNetwork(torch.nn.Module):
             results = result if isinstance(result, tuple) else (result,)
             for name, value in zip(node.outputs, results, strict=False):
                 values[name] = value
-        return tuple(values[name] for name in self.outputs)
+        found = [values[name] for name in self.outputs]
+        if self.controls > 1:
+            columns = [
+                value.reshape(len(value), -1) for value in found[: self.controls]
+            ]
+            found[: self.controls] = [torch.cat(columns, 1)]
+        return tuple(found)
 
     def _evaluate(self, node: Node, call: Call) -> Any:
         try:

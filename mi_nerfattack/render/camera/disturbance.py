@@ -11,6 +11,7 @@ policies are trained with, too.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +20,7 @@ import numpy as np
 
 from mi_nerfattack.backend.arrays import concat, split, vjp
 from mi_nerfattack.ranges import NonNegative, Whole, checked
+from mi_nerfattack.render.camera.rig import Layout, camera_seed
 
 #: Standard deviations at which the blur's kernel ends.
 _TRUNCATE = 4.0
@@ -69,30 +71,42 @@ class Disturbance:
         exposures = self.exposure_ev_sd * normal[:, :1] + self.colour_ev_sd * colours
         return exposures, self.blur_px_sd * abs(normal[:, 1])
 
-    def apply(self, image: Any, step: int) -> Any:
+    def apply(self, image: Any, step: int, layout: Layout | None = None) -> Any:
         """Disturb the images of a batch.
 
         Args:
             image: tensor (n, height, width, 3), sRGB in [0, 1], a row a drive.
             step: index of the control period, from 0.
+            layout: of the images of several cameras in it. They have one exposure and
+                one blur, which ends where an image does, and noise of their own.
 
         Returns:
             a tensor like it; differentiable.
         """
         exposures, blurs = self.draws(image.shape[0])
         return disturbed(
-            image, exposures, blurs, self.noise_sd, self.seed, step, self.first
+            image,
+            exposures,
+            blurs,
+            self.noise_sd,
+            self.seed,
+            step,
+            self.first,
+            layout,
         )
 
-    def vjp(self, image: Any, step: int, d_shown: Any) -> Any:
+    def vjp(
+        self, image: Any, step: int, d_shown: Any, layout: Layout | None = None
+    ) -> Any:
         """Return the derivative by the image from the one by what is shown.
 
         Args:
             image: as given to :meth:`apply`.
             step: likewise.
             d_shown: derivative of the objective by its result, of the same shape.
+            layout: as given to :meth:`apply`.
         """
-        result = vjp(lambda x: self.apply(x, step), image, d_shown)
+        result = vjp(lambda x: self.apply(x, step, layout), image, d_shown)
         dr.eval(result)
         return result
 
@@ -105,6 +119,7 @@ def disturbed(
     seed: int,
     step: int,
     first: int = 0,
+    layout: Layout | None = None,
 ) -> Any:
     """Blur and expose images, and add noise.
 
@@ -116,10 +131,17 @@ def disturbed(
         seed: of the noise.
         step: likewise.
         first: likewise, number of the first image.
+        layout: of the images of several cameras; None for one.
 
     Returns:
         a tensor like it; differentiable.
     """
+    if layout is not None and len(layout.sizes) > 1:
+        parts = []
+        for k, part in enumerate(layout.split(image)):
+            own = camera_seed(seed, k)
+            parts.append(disturbed(part, exposures, blurs, noise_sd, own, step, first))
+        return side_by_side(parts, layout)
     kind, shape, value = type(image.array), image.shape, image.array
     if exposures.any() or blurs.any():
         # Lens and shutter act on linear light
@@ -134,6 +156,30 @@ def disturbed(
         value = value + dr.opaque(kind, noise_sd) * noise  # the image itself stays
         value = dr.clip(value, 0, 1)
     return type(image)(value, shape)
+
+
+def side_by_side(images: Sequence[Any], layout: Layout) -> Any:
+    """Lay images side by side, as :meth:`Layout.join` does; differentiable.
+
+    Args:
+        images: tensors (n, height, width, 3) of Dr.Jit, of all cameras.
+        layout: of the frame.
+    """
+    width, height = layout.size
+    kind = type(images[0].array)
+    shape = (images[0].shape[0], height, width, 3)
+    index = dr.arange(dr.uint32_array_t(kind), math.prod(shape))
+    pixel, channel = index // 3, index % 3
+    row, column = pixel // width, pixel % width
+    image, row = row // height, row % height
+    frame = dr.zeros(kind, math.prod(shape))
+    for part, columns, (wide, high) in zip(
+        images, layout.columns, layout.sizes, strict=True
+    ):
+        inside = (column >= columns.start) & (column < columns.stop) & (row < high)
+        source = ((image * high + row) * wide + column - columns.start) * 3 + channel
+        frame += dr.gather(kind, part.array, source, inside)
+    return type(images[0])(frame, shape)
 
 
 def blur(value: Any, shape: tuple[int, ...], blurs: np.ndarray) -> Any:

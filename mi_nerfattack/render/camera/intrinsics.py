@@ -224,6 +224,8 @@ class CameraMount:
         height_m: above the ground plane z = 0.
         forward_m: ahead of the state's reference point.
         pitch_deg: rotation of the optical axis, positive looks down.
+        left_m: to the left of the reference point.
+        yaw_deg: rotation about the vertical, positive looks to the left.
 
     Raises:
         InputError: a value is not finite.
@@ -232,11 +234,22 @@ class CameraMount:
     height_m: float = 1.4
     forward_m: float = 0.5
     pitch_deg: float = 6.0
+    left_m: float = 0.0
+    yaw_deg: float = 0.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not math.isfinite(value):
                 raise InputError(f"mount.{name}: {value}; must be finite")
+
+    def described(self) -> dict[str, float]:
+        """Return the numbers as JSON, `left_m` and `yaw_deg` only where not 0.
+
+        So a camera that looks ahead from the middle is described as it was before
+        mounts had these two numbers, and what was made with it keeps its identity.
+        """
+        found = dict(vars(self))
+        return {k: v for k, v in found.items() if v or k not in ("left_m", "yaw_deg")}
 
 
 def mount_matrix(states: np.ndarray, mount: CameraMount) -> np.ndarray:
@@ -250,18 +263,19 @@ def mount_matrix(states: np.ndarray, mount: CameraMount) -> np.ndarray:
         camera_to_world: (n, 4, 4), OpenCV axes, float64.
     """
     px, py, theta = np.asarray(states, np.float64).reshape(-1, 3).T
-    pitch = math.radians(mount.pitch_deg)
-    sin_theta, cos_theta = np.sin(theta), np.cos(theta)
+    pitch, heading = math.radians(mount.pitch_deg), theta + math.radians(mount.yaw_deg)
+    sin_heading, cos_heading = np.sin(heading), np.cos(heading)
     matrix = np.zeros((len(px), 4, 4))
-    matrix[:, 0, 0], matrix[:, 1, 0] = sin_theta, -cos_theta
-    matrix[:, 0, 1] = -cos_theta * math.sin(pitch)
-    matrix[:, 1, 1] = -sin_theta * math.sin(pitch)
+    matrix[:, 0, 0], matrix[:, 1, 0] = sin_heading, -cos_heading
+    matrix[:, 0, 1] = -cos_heading * math.sin(pitch)
+    matrix[:, 1, 1] = -sin_heading * math.sin(pitch)
     matrix[:, 2, 1] = -math.cos(pitch)
-    matrix[:, 0, 2] = cos_theta * math.cos(pitch)
-    matrix[:, 1, 2] = sin_theta * math.cos(pitch)
+    matrix[:, 0, 2] = cos_heading * math.cos(pitch)
+    matrix[:, 1, 2] = sin_heading * math.cos(pitch)
     matrix[:, 2, 2] = -math.sin(pitch)
-    matrix[:, 0, 3] = px + mount.forward_m * cos_theta
-    matrix[:, 1, 3] = py + mount.forward_m * sin_theta
+    sin_theta, cos_theta = np.sin(theta), np.cos(theta)
+    matrix[:, 0, 3] = px + mount.forward_m * cos_theta - mount.left_m * sin_theta
+    matrix[:, 1, 3] = py + mount.forward_m * sin_theta + mount.left_m * cos_theta
     matrix[:, 2, 3] = mount.height_m
     matrix[:, 3, 3] = 1
     return matrix

@@ -85,7 +85,12 @@ def lens_rays(
 
 
 def mount_pose(
-    state: tuple[Any, Any, Any], height_m: Any, forward_m: float, pitch_deg: Any
+    state: tuple[Any, Any, Any],
+    height_m: Any,
+    forward_m: float,
+    pitch_deg: Any,
+    left_m: float = 0.0,
+    yaw_deg: float = 0.0,
 ) -> tuple[Any, tuple[Any, Any, Any]]:
     """Place a mounted camera in the world; differentiable in the state.
 
@@ -93,10 +98,12 @@ def mount_pose(
         state: px, py (metres), theta (radians), each a `mi.Float` with one entry per
             vehicle.
         height_m: as in `CameraMount`, or a `mi.Float` with one entry per vehicle; it
-            and the next two reach the kernel as opaque values, so that another mount
-            needs no other kernel.
+            and all that follow reach the kernel as opaque values, so that another
+            mount needs no other kernel.
         forward_m: as in `CameraMount`.
         pitch_deg: like the height.
+        left_m: as in `CameraMount`.
+        yaw_deg: likewise.
 
     Returns:
         origin (`mi.Point3f`) and the columns (right, down, forward) of the rotation
@@ -107,13 +114,25 @@ def mount_pose(
         pitch = pitch_deg * (math.pi / 180)
     else:
         pitch = dr.opaque(mi.Float, math.radians(pitch_deg))
-    height, ahead = (
+    height, ahead, left = (
         value if isinstance(value, mi.Float) else dr.opaque(mi.Float, value)
-        for value in (height_m, forward_m)
+        for value in (height_m, forward_m, left_m)
     )
     sin_pitch, cos_pitch = dr.sincos(pitch)
     sin_theta, cos_theta = dr.sincos(theta)
-    origin = mi.Point3f(px + ahead * cos_theta, py + ahead * sin_theta, height)
+    origin = mi.Point3f(
+        px + ahead * cos_theta - left * sin_theta,
+        py + ahead * sin_theta + left * cos_theta,
+        height,
+    )
+    # The optical axis: the vehicle's heading turned to the left, by a sum of angles
+    # that changes no bit of values and derivatives where the turn is 0
+    yaw = math.radians(yaw_deg)
+    sin_yaw, cos_yaw = (dr.opaque(mi.Float, f(yaw)) for f in (math.sin, math.cos))
+    sin_theta, cos_theta = (
+        sin_theta * cos_yaw + cos_theta * sin_yaw,
+        cos_theta * cos_yaw - sin_theta * sin_yaw,
+    )
     right = mi.Vector3f(sin_theta, -cos_theta, 0)
     down = mi.Vector3f(-cos_theta * sin_pitch, -sin_theta * sin_pitch, -cos_pitch)
     forward = mi.Vector3f(cos_theta * cos_pitch, sin_theta * cos_pitch, -sin_pitch)

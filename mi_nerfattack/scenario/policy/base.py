@@ -71,7 +71,12 @@ class AbstractPolicySection(Section):
 
     def action(self) -> Action:
         """Return what the policy's answer means."""
-        return Action(self.output, self.control_scale, self._follower())
+        return Action(self.columns, self.control_scale, self._follower())
+
+    @property
+    def columns(self) -> int | tuple[int, ...] | None:
+        """Columns of the controls in the answer."""
+        return self.output
 
     def _follower(self) -> Trajectory | None:
         times, section = self.own_times_s, self.trajectory

@@ -30,7 +30,7 @@ from mi_nerfattack.ranges import Positive, Whole
 from mi_nerfattack.scenario.named_file import Code, File
 from mi_nerfattack.scenario.policy.base import NO_VIEWS, AbstractPolicySection, Views
 from mi_nerfattack.scenario.policy.openpilot import OpenpilotSection
-from mi_nerfattack.scenario.section import Kinds, read_section, refuse
+from mi_nerfattack.scenario.section import Kinds, OneOrSeveral, read_section, refuse
 from mi_nerfattack.scenario.user_code import check_trust
 
 #: Kinds by the suffix of the file.
@@ -156,7 +156,22 @@ class ProgramSection(AbstractNetworkSection):
 
     kind: Literal["exported", "torchscript", "onnx"]
     recurrent: Shapes = ()
-    output_name: str | None = None  # of the control, in an ONNX file with several
+    #: Of the control, in an ONNX file with several; or names of several controls.
+    output_name: OneOrSeveral[str] | None = None
+
+    @property
+    def _names(self) -> tuple[str, ...]:
+        """Names of the outputs that are controls."""
+        name = self.output_name or ()
+        return name if isinstance(name, tuple) else (name,)
+
+    @property
+    def columns(self) -> int | tuple[int, ...] | None:
+        """Columns of the controls; several outputs with names are columns."""
+        several = len(self._names)
+        if several > 1 and self.output is None:
+            return tuple(range(several))
+        return self.output
 
     @model_validator(mode="after")
     def _check_output_name(self) -> Any:
@@ -176,7 +191,7 @@ class ProgramSection(AbstractNetworkSection):
             batch = network.batch
         else:
             network = _load_onnx(path)
-            network.choose(self.output_name, len(self.recurrent))
+            network.choose(self._names, len(self.recurrent))
             batch = network.batch
         return self._policy(network, views, batch, self.recurrent)
 

@@ -57,11 +57,21 @@ def test_mount_by_hand(pitch_deg):
     np.testing.assert_allclose(matrix, expected, atol=1e-12)
 
 
-def test_mount_pose_agrees_with_matrix():
+def test_a_mount_to_the_left_that_looks_back_to_the_left():
+    mount = cam.CameraMount(1.4, 0.5, 0.0, left_m=0.3, yaw_deg=120.0)
+    # heading along +y: left is -x
+    matrix = cam.mount_matrix(np.array([[2.0, 3.0, np.pi / 2]]), mount)[0]
+    c, s = np.cos(np.radians(30)), np.sin(np.radians(30))
+    expected = [[-s, 0, -c, 1.7], [c, 0, -s, 3.5], [0, -1, 0, 1.4], [0, 0, 0, 1]]
+    np.testing.assert_allclose(matrix, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("turned", [(), (0.7, -50.0)])
+def test_mount_pose_agrees_with_matrix(turned):
     states = np.random.default_rng(1).normal(size=(7, 3)) * [10, 10, 3]
-    mount = cam.CameraMount(1.2, -0.3, 12.0)
+    mount = cam.CameraMount(1.2, -0.3, 12.0, *turned)
     columns = tuple(mi.Float(np.float32(column)) for column in states.T)
-    origin, rotation = lens.mount_pose(columns, 1.2, -0.3, 12.0)
+    origin, rotation = lens.mount_pose(columns, 1.2, -0.3, 12.0, *turned)
     matrix = cam.mount_matrix(states, mount)
     np.testing.assert_allclose(origin.numpy().T, matrix[:, :3, 3], atol=1e-5)
     for i, column in enumerate(rotation):
@@ -100,9 +110,8 @@ def test_rays_derivative_in_the_state(rng, wrt):
     def objective(value):
         state = [mi.Float(v) for v in (1.0, 2.0, 0.7)]
         state[wrt] = mi.Float(value)
-        o, d = lens.generate_rays(
-            camera, *lens.mount_pose(tuple(state), 1.4, 0.5, 6), 1
-        )
+        pose = lens.mount_pose(tuple(state), 1.4, 0.5, 6, left_m=0.4, yaw_deg=50)
+        o, d = lens.generate_rays(camera, *pose, 1)
         rows = zip((*o, *d), weights, strict=True)
         return dr.sum(sum(row * mi.Float(weight) for row, weight in rows))
 
@@ -114,9 +123,10 @@ def test_rays_derivative_in_the_state(rng, wrt):
     np.testing.assert_allclose(dr.grad(value)[0], numeric, rtol=1e-3, atol=1e-3)
 
 
-def test_no_kernel_is_compiled_for_another_pose_or_lens():
-    def frame(camera, state):
-        o, d = lens.generate_rays(camera, *lens.mount_pose(state, 1.4, 0.5, 6.0), 1)
+def test_no_kernel_is_compiled_for_another_pose_lens_or_mount():
+    def frame(camera, state, *mount):
+        pose = lens.mount_pose(state, *(mount or (1.4, 0.5, 6.0)))
+        o, d = lens.generate_rays(camera, *pose, 1)
         dr.eval(o, d)
 
     frame(cam.from_fov(31, 17, 90.0), tuple(dr.opaque(mi.Float, v) for v in (0, 0, 0)))
@@ -124,6 +134,7 @@ def test_no_kernel_is_compiled_for_another_pose_or_lens():
         for value in (0.25, 1.5):
             state = tuple(dr.opaque(mi.Float, value) for _ in range(3))
             frame(cam.from_fov(31, 17, 60.0), state)
+            frame(cam.from_fov(31, 17, 60.0), state, 1.0, 0.2, 0.0, 0.4, 50.0)
 
 
 def test_wrong_number_of_poses():

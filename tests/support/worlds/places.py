@@ -24,6 +24,7 @@ from mi_nerfattack.fields.grid import GridField, GridLayout
 from mi_nerfattack.fields.io import save_field
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
+from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.training.settings import CollectSettings
 from mi_nerfattack.vehicle.dynamics import Dubins
@@ -130,7 +131,9 @@ class BlankView(AbstractView):
 def blank_environment(mount: CameraMount | None = None) -> SimulatedEnvironment:
     motion, mount = Motion(Dubins(max_heading_rate=1.5)), mount or CameraMount()
     vehicle = KinematicVehicle(motion, 0.1, 1.5)
-    return SimulatedEnvironment("blank", vehicle, BlankView(), mount, 0.1)
+    view = BlankView()
+    rig = Rig.of_one(view.camera, mount)
+    return SimulatedEnvironment("blank", vehicle, [view], rig, 0.1)
 
 
 KERB_M = 0.12
@@ -177,6 +180,7 @@ class PaintedEnvironment(AbstractEnvironment):
 
     def __init__(self, camera: Camera, conditions: Grey) -> None:
         self.camera, self.conditions = camera, conditions
+        self.rig = Rig.of_one(camera, CameraMount())
         self.states: list[np.ndarray] = []
         self.seen: list[list[PosedField]] = []
         self.seeds: list[int] = []
@@ -235,8 +239,8 @@ class PaintedSite(AbstractSite):
     opened: list[PaintedEnvironment] = field(default_factory=list, compare=False)
 
     @property
-    def camera(self) -> Camera:
-        return from_fov(*self.size_px, 90.0)
+    def rig(self) -> Rig:
+        return Rig.of_one(from_fov(*self.size_px, 90.0), CameraMount())
 
     @property
     def car(self) -> Car:
@@ -253,7 +257,7 @@ class PaintedSite(AbstractSite):
         return Grey()
 
     def open(self, conditions):
-        self.opened.append(PaintedEnvironment(self.camera, conditions))
+        self.opened.append(PaintedEnvironment(self.rig.cameras[0], conditions))
         self.opened[-1].name = self.name
         return self.opened[-1]
 
