@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -17,8 +17,15 @@ if TYPE_CHECKING:
     from mi_nerfattack.commands.shared.progress import StageBars
     from mi_nerfattack.deploy.place import Place
     from mi_nerfattack.deploy.sites import PlaceSite
+    from mi_nerfattack.experiment.retrain.among import FramesAmong
     from mi_nerfattack.experiment.retrain.compare import Comparison
+    from mi_nerfattack.experiment.retrain.new_policy import Successor
+    from mi_nerfattack.experiment.retrain.user_training import (
+        AbstractUserTraining,
+        TrainingOrder,
+    )
     from mi_nerfattack.experiment.transfer.found import FoundAttack
+    from mi_nerfattack.scenario.policy.kinds import AbstractPolicySection
     from mi_nerfattack.scenario.vehicle import AbstractVehicleSection
     from mi_nerfattack.system.workers import AbstractWorkers
     from mi_nerfattack.training.settings import ImitationSettings
@@ -33,11 +40,11 @@ class Retrain:
 
     Drives past the attacks, and past those held out; collects frames among the
     attacked objects, labelled by the expert; trains the policy further on them and on
-    those that it was trained on (--more); and drives again. Only runs count whose
-    scenario the expert itself can drive. Stopped, it continues from DATA, and so it
-    does with more --held-out or --adaptive, without training again. Beside the
-    policy come its program, its record as 'train' writes it, and NAME-retrain.json: the
-    runs, and errors before and after.
+    older ones (--more), or lets --command train it; and drives again. Only runs count
+    whose scenario the expert itself can drive. Stopped, it continues from DATA, and so
+    it does with more --held-out or --adaptive, without training again. Beside the
+    policy come NAME-retrain.json, the runs and errors before and after, and of our
+    training its program and record.
     """
 
     continues: ClassVar[bool] = True
@@ -45,18 +52,24 @@ class Retrain:
     run_folders: Annotated[
         tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN...")
     ]
-    """Folders of finished runs of attack, on one policy of 'train', in one place."""
+    """Folders of finished runs of attack, on one policy, in one place."""
     output: Path
-    """Policy file to write (.safetensors)."""
+    """Policy file to write, of the kind of the old one."""
     data: Path
     """Folder of new frames and checkpoints; made if missing."""
+    command: str | None = None
+    """Your training, such as "python my.py {data} {out}"; there are {policy}, {seed}
+    and {threads}, too."""
+    module: str | None = None
+    """FILE.py:NAME, a function of data, out and seed, instead."""
+    trust_code: bool = False
+    """Run code of --module with all rights of your account."""
     more: tuple[Path, ...] = ()
     """Folders of frames that the policy was trained on; without them it forgets."""
     held_out: tuple[Path, ...] = ()
-    """Runs on the same policy to drive before and after, and not to train on."""
+    """Runs to drive before and after, and not to train on."""
     frames: dict[str, int] | None = None
-    """New frames by environment; surrogate 2048 mitsuba 3072 by default, half of the
-    preset laptop of 'train'."""
+    """New frames by environment: surrogate 2048 mitsuba 3072."""
     skies: tuple[str, ...] = ("day",)
     """Times of day of rendered frames; others than day need a sunsky emitter."""
     exposures_ev: tuple[float, ...] = (-1.0, -0.5, 0.0, 0.5, 1.0)
@@ -77,20 +90,19 @@ class Retrain:
     """Drives before and after of each case: past an attack, and without objects."""
     adaptive: bool = False
     """Attack the new policy in the same scenarios, too, which takes as long as the
-    runs did, and drive past what that finds."""
+    runs did."""
     workers: int | None = None
     """Processes that collect and drive; one a core by default, 1 works in this one."""
     seed: int = 0
     """Of all random numbers."""
     json: bool = False
-    """End with one line of JSON in place of the tables: the content of
-    NAME-retrain.json, and the policy's card."""
+    """End with one line of JSON: NAME-retrain.json and the card."""
 
     def run(self) -> Result:
         """Check, collect, train, drive and write."""
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.progress import StageBars
-        from mi_nerfattack.experiment.retrain.among import AmongFound, attacked_policy
+        from mi_nerfattack.experiment.retrain.among import FramesAmong
         from mi_nerfattack.experiment.retrain.compare import (
             AFTER,
             BEFORE,
@@ -100,65 +112,164 @@ class Retrain:
         )
         from mi_nerfattack.experiment.transfer.found import read_found
         from mi_nerfattack.io import files
-        from mi_nerfattack.policy.pilotnet import PilotNet
         from mi_nerfattack.report.table import card_table, retrain_table
         from mi_nerfattack.system.workers import chosen_workers
         from mi_nerfattack.training.dataset import find_shards
-        from mi_nerfattack.training.imitate import imitate
-        from mi_nerfattack.training.record import training_record, write_trained
 
-        about = self._check_outputs()
+        training = self._user_training()
+        about = self._check_outputs(training)
         variant.ensure()
         attacks = read_found([*self.run_folders, *self.held_out])
-        policy, place = attacked_policy(attacks), self._place(attacks)
-        self._check_apart(policy)
+        policy, place = self._policy(attacks, training), self._place(attacks)
+        order = self._order(policy, training)
         more = [shard for folder in self.more for shard in find_shards(folder)]
         groups, others = self._groups(attacks)
-        settings = self._settings(policy, place)
-        vehicle, old = attacks[0].scenario.vehicle, groups[OLD]
-        sites = self._sites(place, settings, vehicle)
-        routes = list({found.route.name: found.route for found in old}.values())
-        names, workers = self.environments, chosen_workers(self.workers, False)
+        settings = self._settings(policy.attacked, place)
+        sites = self._sites(place, settings, attacks[0].scenario.vehicle)
+        workers = chosen_workers(self.workers, False)
+        frames = FramesAmong(sites, groups[OLD], settings, self.data, workers)
+        names = self.environments
         drives = Comparison(groups, names, self.runs, self.spp, self.data)
         with StageBars() as bars:
-            if not more:
-                bars.say("no --more: trained on new frames alone, it may forget others")
             before = drives.drive(BEFORE, workers, bars.counter)
-            arguments = (settings, self.data, workers, bars.show)
-            start, staging = PilotNet.load(policy), AmongFound(tuple(old))
-            result = imitate(sites, routes, *arguments, start, more, staging)
-            command = command_line("retrain", self)
-            record = training_record(settings, sites, self.data, result, command)
-            write_trained(self.output, result.module, record)
-            after = drives.drive(AFTER, workers, bars.counter, self.output)
-            anew = self._adapt(drives, before, after, workers, bars)
-        document = _describe(policy, groups, anew, others)
+            shards = frames.collect(bars.show) if training else []
+            card = {} if training else self._fine_tune(frames, policy, more, bars)
+        trained: dict[str, Any] = {}
+        if training:  # without bars, which the output of a command would break
+            trained = self._train(training, order, policy, shards, groups[OLD][0])
+        with StageBars() as bars:
+            setting = policy.setting(self.output)
+            after = drives.drive(AFTER, workers, bars.counter, setting)
+            anew = self._adapt(drives, before, after, setting, workers, bars)
+        document = _describe(policy.about, groups, anew, others) | trained
         document["table"] = table_rows(before, after)
         files.write_json(about, document)
 
         def show() -> None:
-            console().print(card_table(result.card), retrain_table(document))
-            print(f"{self.output}: written; program, record and table are beside it")
+            tables = [card_table(card)] if card else []
+            console().print(*tables, retrain_table(document))
+            print(f"{self.output}: written; what came of it is beside it")
 
-        return Result({**document, "environments": result.card}, show)
+        return Result({**document, "environments": card}, show)
 
-    def _check_outputs(self) -> Path:
+    def _user_training(self) -> AbstractUserTraining | None:
+        """Return the training that is asked for; None for ours."""
+        from mi_nerfattack.experiment.retrain.user_training import chosen_training
+
+        training = chosen_training(self.command, self.module, self.trust_code)
+        defaults = {item.name: item.default for item in fields(self)}
+        for name in ("more", "epochs", "batch", "learning_rate", "card_runs"):
+            if training is not None and getattr(self, name) != defaults[name]:
+                raise InputError(
+                    f"--{name.replace('_', '-')}: is of our training; leave it out, or "
+                    "give it to yours in its own words"
+                )
+        return training
+
+    def _check_outputs(self, training: AbstractUserTraining | None) -> Path:
         """Check that all can be written; return where the comparison is."""
         from mi_nerfattack.commands.shared.fit_report import check_output
         from mi_nerfattack.io import files
         from mi_nerfattack.policy.exported import SUFFIX
 
-        check_output(self.output)
-        about = self.output.with_name(f"{self.output.stem}-retrain.json")
-        for path in (*map(self.output.with_suffix, (SUFFIX, ".json")), about):
+        beside = [self.output.with_name(f"{self.output.stem}-retrain.json")]
+        if training is None:
+            check_output(self.output)
+            beside = [*map(self.output.with_suffix, (SUFFIX, ".json")), *beside]
+        for path in (self.output, *beside):
             files.check_writable(path)
-        return about
+        return beside[-1]
+
+    def _policy(
+        self, attacks: Sequence[FoundAttack], training: AbstractUserTraining | None
+    ) -> Successor:
+        """Return the attacked policy, which -o can follow."""
+        from mi_nerfattack.experiment.retrain.among import (
+            attacked_policy,
+            attacked_weights,
+        )
+        from mi_nerfattack.experiment.retrain.new_policy import Successor
+
+        if training is None:
+            attacked_weights(attacks)  # refuses all but PilotNet
+        policy = Successor(attacked_policy(attacks))
+        if policy.file is not None and self.output.resolve() == policy.file.resolve():
+            raise InputError(
+                f"{self.output}: is the policy that was attacked, which its runs "
+                "still need; choose another file with -o"
+            )
+        policy.check_suffix(self.output)
+        return policy
+
+    def _order(
+        self, policy: Successor, training: AbstractUserTraining | None
+    ) -> TrainingOrder:
+        """Return what a training is given, which can do with it."""
+        from mi_nerfattack.experiment.retrain.user_training import TrainingOrder
+        from mi_nerfattack.system.workers import available_cores
+
+        data = self.data.resolve()
+        order = TrainingOrder(
+            data=data / "round_0",
+            out=data / "trained" / f"policy{self.output.suffix}",
+            policy=policy.file,
+            seed=self.seed,
+            threads=self.workers or available_cores(),
+        )
+        if training is not None:
+            training.check(order)
+        return order
+
+    def _fine_tune(
+        self,
+        frames: FramesAmong,
+        policy: Successor,
+        more: Sequence[Path],
+        bars: StageBars,
+    ) -> dict[str, Any]:
+        """Train PilotNet further, and write it; return its card."""
+        from mi_nerfattack.policy.pilotnet import PilotNet
+        from mi_nerfattack.training.record import training_record, write_trained
+
+        if not more:
+            bars.say("no --more: trained on new frames alone, it may forget others")
+        assert policy.file is not None
+        result = frames.imitate(PilotNet.load(policy.file), more, bars.show)
+        command = command_line("retrain", self)
+        record = training_record(
+            frames.settings, frames.sites, self.data, result, command
+        )
+        write_trained(self.output, result.module, record)
+        return result.card
+
+    def _train(
+        self,
+        training: AbstractUserTraining,
+        order: TrainingOrder,
+        policy: Successor,
+        shards: Sequence[Path],
+        found: FoundAttack,
+    ) -> dict[str, Any]:
+        """Let somebody else's training write the new policy; return what it was."""
+        from mi_nerfattack.experiment.retrain.new_policy import install, try_policy
+        from mi_nerfattack.experiment.retrain.user_training import train_once
+        from mi_nerfattack.training.record import count_frames
+
+        about = train_once(
+            training,
+            order,
+            shards,
+            lambda: try_policy(found, policy.setting(order.out), self.adaptive),
+        )
+        install(order.out, self.output)
+        return {"training": {**about, "frames": count_frames(self.data, shards)}}
 
     def _adapt(
         self,
         drives: Comparison,
         before: dict[str, Any],
         after: dict[str, Any],
+        policy: str,
         workers: AbstractWorkers,
         bars: StageBars,
     ) -> list[FoundAttack]:
@@ -171,8 +282,8 @@ class Retrain:
         if not self.adaptive:
             return []
         show = bars.counter("attacking anew", "attack ")
-        rest = self.output, self.data / ADAPTIVE, workers, show
-        anew = attack_anew(drives.groups[OLD], *rest)
+        folder = self.data / ADAPTIVE
+        anew = attack_anew(drives.groups[OLD], policy, folder, workers, show)
         again = replace(drives, groups={ADAPTIVE: anew})
         after.update(again.drive(AFTER, workers, bars.counter))
         before[ADAPTIVE] = before[OLD]  # past the attacks on the policy before
@@ -197,13 +308,6 @@ class Retrain:
             for name in settings.sites
         ]
 
-    def _check_apart(self, policy: Path) -> None:
-        if self.output.resolve() == policy.resolve():
-            raise InputError(
-                f"{self.output}: is the policy that was attacked, which its runs "
-                "still need; choose another file with -o"
-            )
-
     def _groups(
         self, attacks: Sequence[FoundAttack]
     ) -> tuple[dict[str, list[FoundAttack]], dict[str, str]]:
@@ -223,17 +327,20 @@ class Retrain:
             raise InputError("RUN: none can be driven by the expert; give other runs")
         return {name: some for name, some in groups.items() if some}, others
 
-    def _settings(self, policy: Path, place: Place) -> ImitationSettings:
+    def _settings(
+        self, policy: AbstractPolicySection, place: Place
+    ) -> ImitationSettings:
         from dataclasses import replace
 
         from mi_nerfattack.evaluation.evaluate import EvaluateSettings
+        from mi_nerfattack.experiment.retrain.among import attacked_drives
         from mi_nerfattack.experiment.transfer.columns import PASTED
         from mi_nerfattack.training.settings import (
             CLONING,
             CollectSettings,
             ImitationSettings,
         )
-        from mi_nerfattack.training.sources import Mixture, PolicyDrives
+        from mi_nerfattack.training.sources import Mixture
         from mi_nerfattack.training.train import TrainSettings
 
         frames = FRAMES if self.frames is None else self.frames
@@ -241,7 +348,7 @@ class Retrain:
             if name not in PASTED:
                 raise InputError(f"--frames: {name!r}; of {', '.join(PASTED)}")
         # where the attacked policy goes, the expert shows it the way back
-        cloning = Mixture((CLONING, PolicyDrives(policy)), (0.6, 0.4))
+        cloning = Mixture((CLONING, attacked_drives(policy, place.rig)), (0.6, 0.4))
         width = place.car.width
         drives = EvaluateSettings(runs=1, objects=(), car_width_m=width)
         return ImitationSettings(
@@ -259,17 +366,16 @@ class Retrain:
 
 
 def _describe(
-    policy: Path,
+    policy: dict[str, str],
     groups: Mapping[str, Sequence[FoundAttack]],
     anew: Sequence[FoundAttack],
     others: dict[str, str],
 ) -> dict[str, Any]:
     from mi_nerfattack.experiment.retrain.compare import HELD_OUT, OLD
-    from mi_nerfattack.io import files
 
     return {
         "schema": 1,
-        "policy": {"file": policy.name, "sha256": files.sha256(policy)},
+        "policy": policy,
         "runs": [found.about for found in groups[OLD]],
         "held_out": [found.about for found in groups.get(HELD_OUT, ())],
         "adaptive": [found.about for found in anew],

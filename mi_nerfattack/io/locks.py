@@ -17,20 +17,24 @@ except ImportError:  # not on Windows, which has no such locks
 
 
 @contextmanager
-def exclusive(folder: str | Path) -> Iterator[None]:
+def exclusive(folder: str | Path) -> Iterator[int | None]:
     """Keep other processes of this program out of a folder.
 
     The lock ends with the process, however it ends, and leaves no file. Where the
-    file system or platform has no locks, nothing is kept out.
+    file system or platform has no locks, nothing is kept out. A process that inherits
+    what is yielded keeps the lock, too.
 
     Args:
         folder: must exist.
+
+    Yields:
+        the descriptor that has the lock; None where there are no locks.
 
     Raises:
         InputError: another process works in the folder, or it may not be read.
     """
     if fcntl is None:
-        yield
+        yield None
         return
     with files.reported(folder):
         descriptor = os.open(folder, os.O_RDONLY)
@@ -43,7 +47,7 @@ def exclusive(folder: str | Path) -> Iterator[None]:
             ) from err
         except OSError:  # some network file systems: work without, as on Windows
             pass
-        yield
+        yield descriptor
     finally:
         os.close(descriptor)
 

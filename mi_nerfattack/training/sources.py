@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -58,6 +58,30 @@ class Scenery:
         """Put the vehicle at a pose and return the image."""
         seed = int(self.rng.integers(2**31))
         return self.environment.reset(self.route, pose, seed).image
+
+    def drive(
+        self,
+        control: Callable[[np.ndarray], float],
+        horizon: int,
+        expert_share: float = 0.0,
+    ) -> Iterator[Labelled]:
+        """Drive from the first pose, until the horizon or the vehicle has strayed.
+
+        Args:
+            control: called with images (height, width, 3) uint8 of the periods in which
+                the expert does not drive, one after the other.
+            horizon: control periods, each a frame.
+            expert_share: probability of a period in which the expert drives.
+        """
+        yield (frame := self.label(self.reset(self.poses[0]), 0))
+        for step in range(1, horizon):
+            held = frame.control
+            if self.rng.uniform() >= expert_share:
+                held = control(frame.image)
+            image = self.environment.step(held).image
+            if self.strayed:
+                return
+            yield (frame := self.label(image, step))
 
     def label(self, image: np.ndarray, step: int) -> Labelled:
         """Add the vehicle's pose and the expert's control to the image of a step."""
@@ -174,15 +198,10 @@ class PolicyDrives(AbstractSource):
 
     def frames(self, prepared: PilotNet, scenery: Scenery) -> Iterator[Labelled]:
         """Drive until the horizon, or until the vehicle has strayed."""
-        yield (frame := scenery.label(scenery.reset(scenery.poses[0]), 0))
-        for step in range(1, self.horizon):
-            control = frame.control
-            if scenery.rng.uniform() >= self.expert_share:
-                control = steer(prepared, frame.image, scenery.route.goal)
-            image = scenery.environment.step(control).image
-            if scenery.strayed:
-                return
-            yield (frame := scenery.label(image, step))
+        goal = scenery.route.goal
+        yield from scenery.drive(
+            lambda image: steer(prepared, image, goal), self.horizon, self.expert_share
+        )
 
 
 @dataclass(frozen=True)

@@ -154,7 +154,7 @@ def test_workers_make_the_vehicle_of_a_runs_user(run, tmp_path, monkeypatch):
     (found,) = read_found([custom])
     command = Retrain((custom,), tmp_path / "o", tmp_path / "d", exposures_ev=(0.0,))
     place = command._place([found])
-    settings = command._settings(Path(found.scenario.policy.file.file), place)
+    settings = command._settings(found.scenario.policy, place)
     sent = pickle.dumps(command._sites(place, settings, found.scenario.vehicle))
     for name in [name for name in sys.modules if name.startswith("mi_nerfattack_user")]:
         monkeypatch.delitem(sys.modules, name)

@@ -35,8 +35,8 @@ USAGE = "shows what may be given, in words that stand for it"
 SKIPPED = {
     **dict.fromkeys("README bench index policy refine room training".split(), LONG),
     **dict.fromkeys("attack sweep".split(), USAGE),
-    **dict.fromkeys("fields place render report retrain".split(), INPUT),
-    **dict.fromkeys("transfer view".split(), INPUT),
+    **dict.fromkeys("examples fields place render report".split(), INPUT),
+    **dict.fromkeys("retrain transfer view".split(), INPUT),
     "commands": "writes into the home folder",
     "environments": "takes CARLA's server, or more than a minute",
     "install": "installs",

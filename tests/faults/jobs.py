@@ -184,6 +184,19 @@ JOBS = {
         places=2,
         slow=True,
     ),
+    "retrain by a module": Job(
+        "retrain run",
+        "-o new.safetensors --data data --module mine.py:train --trust-code --runs 1 "
+        "--frames surrogate 64 --exposures-ev 0 --environments surrogate",
+        "module",
+        ("new.safetensors", "new-retrain.json"),
+        "data/**/shard_*",
+        "data/old_before",
+        ("lock",),
+        leaves="*",
+        places=2,
+        slow=True,
+    ),
 }
 #: Commands that write at their ends, and what they would read, which is missing where
 #: it can be; the last word is the output. By the folder that they claim, if any.

@@ -38,6 +38,16 @@ PILOTNET = {
     "runs = 2": "runs = 1",
     "[7.0, 4.2, 1.6]": "[-13.0, 3.4, 1.6]",
 }
+#: A training that changes the weights of a policy a little.
+MODULE = """\
+from mi_nerfattack.policy import PilotNet
+
+def train(data, out, seed):
+    network = PilotNet.load("policy.safetensors")
+    for value in network.parameters():
+        value.data += 1e-3 * (seed + 1)
+    network.save(out)
+"""
 
 
 def scenario(folder: Path, patch: pytest.MonkeyPatch) -> None:
@@ -101,10 +111,21 @@ def site(folder: Path, patch: pytest.MonkeyPatch) -> None:
 
 def pilotnet(folder: Path, patch: pytest.MonkeyPatch | None = None) -> None:
     """Attack PilotNet, without pictures; `run` is the finished run."""
-    attack_jobs.write_scenario(folder, PILOTNET)
+    attacked(folder, PILOTNET)
+
+
+def attacked(folder: Path, changes: dict[str, str]) -> None:
+    """Attack the policy of a scenario; `run` is the finished run."""
+    attack_jobs.write_scenario(folder, changes)
     routes = files.read_json(folder / "routes.json")
     routes["line"]["points_m"] = [[-20.0, 0.0], [-8.0, 0.0]]
     files.write_json(folder / "routes.json", routes)
     loaded, text = load_scenario(folder / "scenario.toml")
     job = Job(loaded, text, loaded.build_policy(), folder / "run", frames=None)
     job.run(anyway=True)
+
+
+def module(folder: Path, patch: pytest.MonkeyPatch) -> None:
+    """Attack PilotNet, and write a training of it."""
+    pilotnet(folder)
+    (folder / "mine.py").write_text(MODULE)

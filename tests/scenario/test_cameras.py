@@ -12,11 +12,13 @@ from mi_nerfattack import cli
 from mi_nerfattack.commands.shared.policy_file import PolicyFile, read_camera
 from mi_nerfattack.deploy.place import bundled_place
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.transfer.columns import make_columns
 from mi_nerfattack.io import files
 from mi_nerfattack.io.exr import read_layers
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
 from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.scenario.scenario import Scenario, load_scenario
+from mi_nerfattack.scenario.world import build_world
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -134,11 +136,30 @@ goal = { kind = "integer", count = 1 }
 }
 
 
-def test_an_attack_on_a_policy_of_two_cameras(tmp_path):
-    folder = write_scenario(tmp_path / "attack", CHANGES)
-    (folder / "two.py").write_text(NET)
-    path, run = folder / "scenario.toml", tmp_path / "run"
+def write_attack(folder: Path) -> Path:
+    """Write a scenario with two cameras and a policy that reads both."""
+    (write_scenario(folder, CHANGES) / "two.py").write_text(NET)
+    path = folder / "scenario.toml"
     path.write_text(path.read_text() + CAMERAS)
+    return path
+
+
+@pytest.mark.parametrize("name", ["surrogate", "mitsuba"])
+def test_an_error_of_the_pitch_is_drawn_for_each_camera(name, tmp_path):
+    scenario, _ = load_scenario(write_attack(tmp_path))
+    world = build_world(scenario, scenario.build_policy())
+    (column,) = make_columns([name], ["pitch:2"], 1)
+    environment = column.open(world, world.surrogate.objects, 3)
+    assert environment.rig.names == RIG.names
+    pairs = zip(environment.rig.mounts, RIG.mounts, strict=True)
+    first, second = (one.pitch_deg - other.pitch_deg for one, other in pairs)
+    assert 0 != first != second != 0
+    assert environment.rig.mounts[1].yaw_deg == 40.0
+    assert environment.reset(world.route, None, 1).image.shape == (12, 40, 3)
+
+
+def test_an_attack_on_a_policy_of_two_cameras(tmp_path):
+    path, run = write_attack(tmp_path / "attack"), tmp_path / "run"
     assert cli.main(["check", str(path), "-o", str(tmp_path / "check.png")]) in (0, 1)
     command = ["attack", str(path), "-o", str(run), "--anyway", "--pictures", "1"]
     few = ["drive.runs=1", "baseline.deployment_textures=1"]

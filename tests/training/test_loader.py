@@ -110,7 +110,7 @@ class Slow(PaintedEnvironment):
 @dataclasses.dataclass(frozen=True)
 class SlowSite(PaintedSite):
     def open(self, conditions):
-        return Slow(self.camera, conditions)
+        return Slow(self.rig.cameras[0], conditions)
 
 
 def test_speed_is_measured_after_the_first_frame_of_a_drive(tmp_path):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 
+from mi_nerfattack.deploy.environment import policy_image, told
 from mi_nerfattack.deploy.place import Place
 from mi_nerfattack.deploy.sites import AbstractSite
 from mi_nerfattack.drives.spec import short_digest
@@ -16,12 +18,23 @@ from mi_nerfattack.experiment.run_folder import object_path
 from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.fields.io import holds_splats
 from mi_nerfattack.io.resumable import differences, flatten, refuse
+from mi_nerfattack.policy.base import AbstractPolicy
+from mi_nerfattack.policy.pilotnet import PilotNet
+from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.scenario.named_file import section_content
-from mi_nerfattack.scenario.policy.kinds import PilotNetSection
+from mi_nerfattack.scenario.policy.kinds import AbstractPolicySection, PilotNetSection
 from mi_nerfattack.scenario.scenario import is_within
 from mi_nerfattack.scenario.world import place_of
-from mi_nerfattack.training.settings import CollectSettings
+from mi_nerfattack.system.workers import AbstractWorkers
+from mi_nerfattack.training.imitate import Imitated, OnStage, collect_frames, imitate
+from mi_nerfattack.training.settings import CollectSettings, ImitationSettings
+from mi_nerfattack.training.sources import (
+    AbstractSource,
+    Labelled,
+    PolicyDrives,
+    Scenery,
+)
 from mi_nerfattack.training.staging import AbstractStage, AbstractStaging, Stretch
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -146,28 +159,148 @@ def _shared(found: FoundAttack) -> dict[str, str]:
     return {key: value for key, value in identity if is_within(key, _SHARED)}
 
 
-def attacked_policy(attacks: Sequence[FoundAttack]) -> Path:
-    """Return the weights that all runs attacked.
+def attacked_policy(attacks: Sequence[FoundAttack]) -> AbstractPolicySection:
+    """Return the policy that all runs attacked, as the first one names it.
+
+    Raises:
+        InputError: they attacked different policies.
+    """
+    first = attacks[0]
+    policy = first.scenario.policy
+    for found in attacks:
+        other = found.scenario.policy
+        if section_content(other) != section_content(policy):
+            raise InputError(
+                f"{found.folder}: attacked {other.source}, {first.folder} "
+                f"{policy.source}, of other content; retrain one policy at a time"
+            )
+    return policy
+
+
+def attacked_weights(attacks: Sequence[FoundAttack]) -> Path:
+    """Return the weights of the PilotNet that all runs attacked.
 
     Raises:
         InputError: they attacked different policies, or one that is not PilotNet alone.
     """
-    first = attacks[0]
     for found in attacks:
-        policy = found.scenario.policy
-        about = section_content(policy)
-        if not isinstance(policy, PilotNetSection) or set(about) - _PLAIN:
+        if not _is_plain(policy := found.scenario.policy):
             raise InputError(
                 f"{found.folder}: attacked {policy.source}; only PilotNet of "
                 "'mi-nerfattack train', without further keys of [policy], can be "
-                "retrained; train another one yourself, on frames that "
-                "experiment.retrain.among collects"
+                "retrained without your help; give your own training with --command "
+                "or --module"
             )
-        if about != section_content(first.scenario.policy):
-            raise InputError(
-                f"{found.folder}: attacked {policy.source}, {first.folder} "
-                f"{first.scenario.policy.source}, of other content; retrain one policy "
-                "at a time"
-            )
-    assert isinstance(first.scenario.policy, PilotNetSection)
-    return first.scenario.policy.file.file
+    policy = attacked_policy(attacks)
+    assert isinstance(policy, PilotNetSection)
+    return policy.file.file
+
+
+def _is_plain(policy: AbstractPolicySection) -> bool:
+    """Whether weights of PilotNet say all about a policy."""
+    return isinstance(policy, PilotNetSection) and set(section_content(policy)) <= (
+        _PLAIN
+    )
+
+
+def attacked_drives(policy: AbstractPolicySection, rig: Rig) -> AbstractSource:
+    """Return drives of an attacked policy, in which the expert labels each frame.
+
+    Args:
+        policy: that was attacked.
+        rig: by which it sees.
+    """
+    if isinstance(policy, PilotNetSection) and _is_plain(policy):
+        return PolicyDrives(policy.file.file)
+    return SectionDrives(policy, rig)
+
+
+@dataclass(frozen=True)
+class SectionDrives(AbstractSource):
+    """As `PolicyDrives`, of any policy that a scenario can name.
+
+    Args:
+        policy: that drives.
+        rig: by which it sees.
+        horizon: control periods of a drive, each a frame.
+    """
+
+    policy: AbstractPolicySection
+    rig: Rig
+    horizon: int = PolicyDrives.horizon
+    kind: ClassVar[str] = "section"
+
+    def describe(self) -> dict[str, Any]:
+        """Return the policy, its files by their checksums, and the horizon."""
+        policy = section_content(self.policy)
+        return {"kind": self.kind, "policy": policy, "horizon": self.horizon}
+
+    def prepare(self) -> AbstractPolicy:
+        """Make the policy."""
+        return self.policy.build(self.rig.views)
+
+    def frames(self, prepared: AbstractPolicy, scenery: Scenery) -> Iterator[Labelled]:
+        """Drive until the horizon, or until the vehicle has strayed."""
+        memory, step = prepared.initial_memory(1), 0
+        environment, route = scenery.environment, scenery.route
+
+        def control(image: np.ndarray) -> float:
+            nonlocal memory, step
+            numbers = told(prepared, environment, route, step)
+            seen, step = policy_image(image), step + 1
+            row, memory = prepared.step(seen, route.goal, memory, numbers)
+            return float(np.array(row)[0])
+
+        yield from scenery.drive(control, self.horizon)
+
+
+@dataclass(frozen=True, eq=False)
+class FramesAmong:
+    """A collection among attacks, and a training on it.
+
+    Args:
+        sites: see `imitate`, as `settings` and `folder`.
+        attacks: whose objects and routes the frames show.
+        settings: of both.
+        folder: of the frames.
+        workers: who collects.
+    """
+
+    sites: Sequence[AbstractSite]
+    attacks: Sequence[FoundAttack]
+    settings: ImitationSettings
+    folder: Path
+    workers: AbstractWorkers
+
+    def collect(self, progress: OnStage) -> list[Path]:
+        """Collect the frames that are not there yet; return all shards."""
+        return collect_frames(
+            self.sites,
+            self.routes,
+            self.settings,
+            self.folder,
+            self.workers,
+            progress,
+            AmongFound(tuple(self.attacks)),
+        )
+
+    def imitate(
+        self, start: PilotNet, more: Sequence[Path], progress: OnStage
+    ) -> Imitated:
+        """Collect them, and train PilotNet further on them and on other shards."""
+        return imitate(
+            self.sites,
+            self.routes,
+            self.settings,
+            self.folder,
+            self.workers,
+            progress,
+            start,
+            more,
+            AmongFound(tuple(self.attacks)),
+        )
+
+    @property
+    def routes(self) -> list[Route]:
+        """Routes of the attacks, each once."""
+        return list({found.route.name: found.route for found in self.attacks}.values())

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from mi_nerfattack.experiment.retrain.compare import with_policy
-from mi_nerfattack.experiment.run_folder import SCENARIO
+from mi_nerfattack.experiment.retrain.compare import read_with_policy
 from mi_nerfattack.experiment.sweep.cell import Cell, folder_of
 from mi_nerfattack.experiment.sweep.grid import axis_name
 from mi_nerfattack.experiment.sweep.sweep import Cells
@@ -18,7 +17,7 @@ from mi_nerfattack.system.workers import AbstractWorkers, raise_failure, tally
 
 def attack_anew(
     attacks: Sequence[FoundAttack],
-    policy: Path,
+    policy: str,
     folder: Path,
     workers: AbstractWorkers,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -30,7 +29,7 @@ def attack_anew(
 
     Args:
         attacks: whose scenarios are attacked.
-        policy: weights that are attacked.
+        policy: that is attacked, see `compare.with_policy`.
         folder: of the cells; made if missing.
         workers: who does them.
         progress: called with attacks done and wanted.
@@ -55,13 +54,13 @@ def attack_anew(
     return list(read_found([folder_of(folder, cell) for cell in cells]))
 
 
-def _cell(found: FoundAttack, policy: Path) -> Cell:
+def _cell(found: FoundAttack, policy: str) -> Cell:
     """Return a run's scenario with another policy as a cell of a sweep.
 
     What the checks before an attack find is told by its flags, and refuses nothing: the
     run counted, too.
     """
-    scenario = with_policy(found, policy).scenario
+    scenario, text = read_with_policy(found, policy)
     ids = "+".join(item.id for item in scenario.objects)
     return Cell(
         axis_name(found.route.name),
@@ -69,7 +68,7 @@ def _cell(found: FoundAttack, policy: Path) -> Cell:
         scenario.attack.method.kind,
         None,
         scenario.seed,
-        portable_text(scenario, files.read_text(found.folder / SCENARIO)),
+        portable_text(scenario, text),
         scenario.digests(),
         anyway=True,
     )

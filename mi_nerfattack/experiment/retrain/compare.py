@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from mi_nerfattack.drives.store import Store
+from mi_nerfattack.experiment.run_folder import SCENARIO
 from mi_nerfattack.experiment.transfer.columns import make_columns
 from mi_nerfattack.experiment.transfer.figures import DRIVES, check_output, run_transfer
 from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.experiment.transfer.work import TransferDrives
 from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT
-from mi_nerfattack.scenario.named_file import NamedFile
+from mi_nerfattack.scenario.scenario import Scenario, load_scenario
 from mi_nerfattack.system.workers import AbstractWorkers
 
 OLD, HELD_OUT, ADAPTIVE = "old", "held_out", "adaptive"
@@ -43,18 +44,16 @@ class Comparison:
     spp: int
     folder: Path
 
-    def work(
-        self, group: str, stage: str, policy: Path | None = None
-    ) -> TransferDrives:
+    def work(self, group: str, stage: str, policy: str = "") -> TransferDrives:
         """Describe the drives of a group; InputError for starts that a run has seen.
 
         Args:
             group: of attacks.
             stage: `BEFORE` or `AFTER`.
-            policy: weights that drive; those that were attacked by default.
+            policy: that drives, see :func:`with_policy`; the attacked one by default.
         """
         attacks = [
-            found if policy is None else with_policy(found, policy)
+            with_policy(found, policy) if policy else found
             for found in self.groups[group]
         ]
         columns = make_columns(self.environments, ("day",), self.spp)
@@ -67,7 +66,7 @@ class Comparison:
         stage: str,
         workers: AbstractWorkers,
         progress: Callable[[str], OnSteps],
-        policy: Path | None = None,
+        policy: str = "",
     ) -> dict[str, dict[str, Any]]:
         """Do the drives that are not there yet; return `transfer.json` by group."""
         found = {}
@@ -83,13 +82,24 @@ class Comparison:
         return self.folder / f"{group}_{stage}"
 
 
-def with_policy(found: FoundAttack, policy: Path) -> FoundAttack:
-    """Let another PilotNet drive past what was found."""
-    section = found.scenario.policy.model_copy(
-        update={"file": NamedFile(str(policy), policy.resolve())}
-    )
-    scenario = found.scenario.model_copy(update={"policy": section})
+def with_policy(found: FoundAttack, policy: str) -> FoundAttack:
+    """Let another policy drive past what was found.
+
+    Args:
+        found: the attack.
+        policy: key and value that replace those of its scenario, as of ``--set``; see
+            `new_policy.setting`.
+
+    Raises:
+        InputError: the scenario with this policy is not usable.
+    """
+    scenario, _ = read_with_policy(found, policy)
     return replace(found, scenario=scenario, identity=scenario.identity())
+
+
+def read_with_policy(found: FoundAttack, policy: str) -> tuple[Scenario, str]:
+    """Read the scenario of :func:`with_policy`; return its text, too."""
+    return load_scenario(found.folder / SCENARIO, settings=(policy,))
 
 
 def table_rows(

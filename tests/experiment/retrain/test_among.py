@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,13 @@ from support.worlds.places import PaintedSite, small
 
 import mi_nerfattack as nf
 from mi_nerfattack.capture.mesh.flat import FlatObject
-from mi_nerfattack.deploy.sites import PlaceSite, Weather
+from mi_nerfattack.deploy.environment import drive
+from mi_nerfattack.deploy.sites import PlaceSite, Weather, expert_of
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.retrain import solvable
 from mi_nerfattack.experiment.retrain.among import (
     AmongFound,
+    attacked_drives,
     attacked_objects,
     found_place,
 )
@@ -31,11 +34,13 @@ from mi_nerfattack.io import locks
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.rollout.drive import ATTACK
+from mi_nerfattack.scenario.policy.kinds import PolicySection
 from mi_nerfattack.scenario.scenario import load_scenario
+from mi_nerfattack.scenario.section import read_section
 from mi_nerfattack.scenario.world import build_world, driven_route
 from mi_nerfattack.system.workers import InThisProcess
 from mi_nerfattack.training.collect import collect
-from mi_nerfattack.training.sources import Scattered
+from mi_nerfattack.training.sources import Scattered, Scenery
 from tests.experiment.conftest import CAMERA
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -135,6 +140,35 @@ def test_frames_are_those_of_the_attack(found):
 def taken_image(environment, run, pose, objects):
     environment.show(objects)
     return environment.reset(run.route, pose, 3).image
+
+
+REMEMBERS = """\
+def steer(image, goal, step):
+    return image.mean((1, 2, 3)) - 0.5 + 0.2 * step
+"""
+
+
+def test_an_attacked_policy_of_any_kind_drives_as_in_a_drive(found, tmp_path):
+    """One that remembers, too; the expert labels what it sees."""
+    (tmp_path / "mine.py").write_text(REMEMBERS)
+    keys = {"kind": "callable", "file": "mine.py:steer", "trust_code": True}
+    section = read_section("policy", PolicySection, keys, tmp_path)
+    source, run = attacked_drives(section, found_place(found).rig), found[0]
+    assert source.describe()["policy"]["kind"] == "callable"
+    site = PlaceSite("surrogate", found_place(found))
+    pose, expert = run.route.pose_at(2.0, 0.3), expert_of(site, run.route)
+    environment = site.open(site.typical())
+    driven = drive(environment, section.build(), run.route, pose, 0, 9)
+    rng = np.random.default_rng(0)
+    scenery = Scenery(environment, run.route, expert, pose[None], rng)
+    frames = list(islice(source.frames(source.prepare(), scenery), 10))
+    environment.close()
+    assert [frame.step for frame in frames] == list(range(10))
+    np.testing.assert_array_equal(
+        [frame.pose for frame in frames], driven.states[:, :3]
+    )
+    for frame in frames:
+        assert frame.control == pytest.approx(expert.control(frame.pose)[0])
 
 
 def test_frames_among_other_attacks_are_refused(found, tmp_path):
