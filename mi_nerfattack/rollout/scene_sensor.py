@@ -15,7 +15,9 @@ from mi_nerfattack.fields.vertex_colours import gradient
 from mi_nerfattack.render.backdrop import Layer
 from mi_nerfattack.render.camera.conventions import from_mitsuba
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
+from mi_nerfattack.render.lighting.shading import light_maps
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import Gain
 from mi_nerfattack.rollout.camera import SceneCamera
 from mi_nerfattack.rollout.parameters import CollectsRays, Differentiated
 from mi_nerfattack.rollout.sensor import (
@@ -90,7 +92,7 @@ class SceneSensor(AbstractDifferentiableSensor):
             self._collector = self.integrator
         self._parameters = Differentiated(scene, self._collector)
         self.select(params)
-        self._lit: set[int] = set()  # layers whose light varies
+        self._lit: dict[int, PosedField] = {}  # by `id`, those whose light varies
         self._counter = [0]  # shared by copies
 
     def __repr__(self) -> str:
@@ -119,19 +121,22 @@ class SceneSensor(AbstractDifferentiableSensor):
     def varied(self, variation: Variation) -> SceneSensor:
         """Return this sensor with another light and mount in each drive of a batch.
 
-        The light varies on the :attr:`objects` that there are now.
+        The light varies on the :attr:`objects` that there are now. Where it has a sun,
+        objects that have no `LightMaps` get those of :func:`light_maps`.
 
         Raises:
             InputError: light on objects, and there are none.
         """
-        objects = {id(posed) for posed in self.objects}
+        objects = {id(posed): posed for posed in self.objects}
         if variation.of_light and not objects:
             raise InputError(
                 "light: there are no objects whose light could vary; show grid fields "
                 "by a field_integrator, and select their colours"
             )
+        for posed in objects.values() if variation.sun is not None else ():
+            posed.light_maps = posed.light_maps or light_maps(posed.field)
         result = self._drawing(self.camera.first, variation)
-        result._lit = objects
+        result._lit = objects if variation.of_light else {}
         return result
 
     def drawing_as(self, other: AbstractSensor) -> SceneSensor:
@@ -216,7 +221,7 @@ class SceneSensor(AbstractDifferentiableSensor):
         ray: mi.Ray3f,
         δL: Any = None,
         state_in: Any = None,
-        gains: Sequence[mi.Color3f] = (),
+        gains: Sequence[Gain] = (),
     ) -> tuple[Any, ...]:
         lit = {"gains": gains} if gains else {}
         return self.integrator.sample(
@@ -233,13 +238,13 @@ class SceneSensor(AbstractDifferentiableSensor):
             **lit,
         )
 
-    def _gains(self, rays: int) -> list[mi.Color3f]:
-        """Return the variation's factors of all layers, (3, n) each; none for 1."""
-        light = self.camera.light(rays // self.camera.per_image)
-        if light is None:
+    def _gains(self, rays: int) -> list[Gain]:
+        """Return the variation's light on all layers; none for that of the capture."""
+        if not self._lit:
             return []
-        plain = mi.Color3f(1)
-        return [light if id(x) in self._lit else plain for x in self.layers]
+        count, lit = rays // self.camera.per_image, self._lit
+        found = {k: self.camera.gain(item, count) for k, item in lit.items()}
+        return [found.get(id(layer), Gain()) for layer in self.layers]
 
     def _observation(
         self, linear: mi.Color3f, kept: Any, view: Any, count: int, step: int

@@ -54,6 +54,9 @@ Trust = Annotated[bool, Field(exclude=True)]  # results do not depend on it
 #: Of a control: a heading rate, a steering angle, or another quantity.
 Unit = Literal["rad/s", "rad", "other"]
 
+#: Marks a key that earlier versions lacked: its default is no part of identities.
+ADDED = "added"
+
 #: Keys and indices that lead to a value of the file.
 Location = tuple[str | int, ...]
 
@@ -250,7 +253,12 @@ def _leaves(location: Location, value: Any) -> Iterator[tuple[Location, Any]]:
     inner: list[tuple[str | int, Any]]
     if isinstance(value, Section):
         keys = type(value).model_fields.items()
-        inner = [(k, getattr(value, k)) for k, field in keys if not field.exclude]
+        inner = [
+            (k, getattr(value, k))
+            for k, field in keys
+            if not field.exclude
+            and not (ADDED in field.metadata and getattr(value, k) == field.default)
+        ]
     elif is_dataclass(value) and hasattr(value, "kind"):
         inner = list(vars(value).items())
     elif isinstance(value, tuple) and value and isinstance(value[0], Section):

@@ -33,7 +33,7 @@ def varied(variation: Variation = ALL) -> tuple[ClosedLoop, SceneSensor]:
     loop, _ = toy.make_loop()
     plain = loop.sensor
     assert isinstance(plain, SceneSensor)
-    dynamics = Varied(loop.dynamics, variation)
+    dynamics = Varied(loop.dynamics, variation, loop.transition.dt)
     return replace(loop, sensor=plain.varied(variation), dynamics=dynamics), plain
 
 
@@ -103,7 +103,7 @@ def test_each_drive_has_its_own_vehicle(model):
     variation = Variation(speed_sd=0.2, steering_sd=0.3, seed=3)
     drawn = variation.draws(0, 3)
     rows = model.state_size
-    vehicle = Varied(model, variation)
+    vehicle = Varied(model, variation, 0.1)
     loop, _ = toy.make_loop()
     start = replace(loop, dynamics=model).initial(POSES)
     control = type(start[0])([0.3, -0.2, 0.1])
