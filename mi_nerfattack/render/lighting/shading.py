@@ -27,6 +27,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.backend.arrays import upload
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import FLAT, AbstractField
 from mi_nerfattack.render.lighting.lights import Light, Lighting, Sunlight, dome
 from mi_nerfattack.render.lighting.relight import CLEARANCE
@@ -63,7 +64,7 @@ class LightMaps(AbstractLightMaps):
         captured: Light | None,
         views: np.ndarray | None = None,
     ) -> None:
-        self._shape = geometry(PosedField(field))
+        self.field = field
         self._captured = captured
         self._views = _from_above() if views is None else views
         self._surface: _Surface | None = None
@@ -118,12 +119,11 @@ class LightMaps(AbstractLightMaps):
     def _map(self, light: Light) -> np.ndarray:
         """Return the factors under a light, (v, 4)."""
         if self._surface is None:
-            self._surface = _Surface(self._shape, self._views, self.shape)
-            self._before = self._surface.irradiance(self._captured)
+            self._surface = _Surface(self.field, self._views, self.shape)
         surface = self._surface
-        now, known = surface.spread(surface.irradiance(light)), surface.known
-        before = surface.spread(self._before)
-        known = known & (before.min(1) > _DARK)
+        before = surface.spread(surface.irradiance(self._captured))
+        known = surface.known & (before.min(1) > _DARK)
+        now = surface.spread(surface.irradiance(light))
         factors = now / np.where(known, before.T, 1).T
         found = np.ones((len(factors), 4), np.float32)
         found[:, :3] = factors[_nearest(known, self.shape)]
@@ -160,20 +160,25 @@ class _Surface:
     """Points of a field's surface, and the lattice vertices around them.
 
     Args:
-        shape: a `geometry` in its own frame.
+        source: field whose density counts.
         views: (k, 3), sides from which it is looked at.
         counts: vertices of the lattice along x, y and z.
     """
 
     def __init__(
-        self, shape: PosedField, views: np.ndarray, counts: tuple[int, ...]
+        self, source: AbstractField, views: np.ndarray, counts: tuple[int, ...]
     ) -> None:
-        self._shape = shape
-        lower, upper = shape.field.lower, shape.field.upper
+        self._shape = shape = geometry(PosedField(source))
+        lower, upper = source.lower, source.upper
         cells = np.array(counts) - 1
         edge = float(((upper - lower) / cells).max())
         found = [_look(shape, view, edge) for view in views]
         point, normal = (np.concatenate(part) for part in zip(*found, strict=True))
+        if not len(point):
+            raise InputError(
+                f"sun: the {source.kind} is nowhere opaque, so that it has no surface "
+                "to light; remove [attack.vary.sun]"
+            )
         # One mean of each cell and side of the surface, whose normals are noisy
         place = ((point - lower) / (upper - lower) * cells).clip(0, cells - 1e-6)
         axis = np.abs(normal).argmax(1)
@@ -189,7 +194,7 @@ class _Surface:
             ((self._point - lower) / (upper - lower) * cells).clip(0, cells - 1e-6),
             counts,
         )
-        self._clearance = CLEARANCE * shape.field.step_m
+        self._clearance = CLEARANCE * source.step_m
         self._got: dict[bytes, np.ndarray] = {}  # by direction
         self._count = int(np.prod(counts))
         #: (v,), vertices that a point lies beside.
@@ -211,12 +216,14 @@ class _Surface:
     def _cosine(self, towards: np.ndarray) -> np.ndarray:
         """Return what points get of a light of strength 1 from a direction, (n,)."""
         cosine = self._normal @ towards
+        result = np.zeros(len(cosine), np.float32)
         (facing,) = np.nonzero(cosine > 0)
+        if not len(facing):
+            return result
         start = self._point[facing] + self._clearance * self._normal[facing]
         rays = Rays(_point(start), mi.Vector3f(*map(float, towards)))
         dr.make_opaque(rays)
         passed = 1 - march(self._shape, rays, STOP).opacity.numpy()
-        result = np.zeros(len(cosine), np.float32)
         result[facing] = cosine[facing] * passed
         return result
 
