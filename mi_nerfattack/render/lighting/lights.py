@@ -154,17 +154,47 @@ class Sunlight:
         Args:
             rotation: (3, 3), from the frame of the directions to the world.
         """
-        sun, towards = sun_direction(self.elevation_deg, self.azimuth_deg), dome()
-        height = sun[2]
-        # Of a sky of radiance 1, a surface that faces the sun sees (1 + height) / 2
-        facing = self.share / (1 - self.share) * (1 + height) / 2
-        ground = _ALBEDO * (1 + facing * height)
-        whole = facing + (1 + height) / 2 + ground * (1 - height) / 2
+        towards, (direct, sky, ground) = dome(), self._parts
         is_sky = towards @ rotation[2] > 0  # the world's z
-        radiance = np.where(is_sky, 1.0, ground) / whole
+        radiance = np.where(is_sky, sky, ground)
         diffuse = np.repeat(radiance[:, None] * 4 / len(towards), 3, axis=1)
-        colour = black_body(self.colour_k) * facing / whole
-        return _add((towards, diffuse), ((sun @ rotation)[None], colour[None]))
+        colour = direct * black_body(self.colour_k)
+        return _add((towards, diffuse), ((self._sun @ rotation)[None], colour[None]))
+
+    def emitters(self) -> dict[str, Any]:
+        """Describe the same as an `envmap` and, if it shines, a `directional` sun."""
+        direct, sky, ground = self._parts
+        image = np.full((64, 128, 3), sky, np.float32)
+        image[32:] = ground
+        found: dict[str, Any] = {
+            "dome": {
+                "type": "envmap",
+                "bitmap": mi.Bitmap(image),
+                "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90),  # z is up
+            }
+        }
+        if direct > 0:
+            irradiance = np.pi * direct * black_body(self.colour_k)
+            found["sun"] = {
+                "type": "directional",
+                "direction": (-self._sun).tolist(),
+                "irradiance": {"type": "rgb", "value": irradiance.tolist()},
+            }
+        return found
+
+    @property
+    def _sun(self) -> np.ndarray:
+        return sun_direction(self.elevation_deg, self.azimuth_deg)
+
+    @property
+    def _parts(self) -> tuple[float, float, float]:
+        """Return a sun's `Light.strength`, and the radiances of sky and ground."""
+        height = float(self._sun[2])
+        # Of a sky of radiance 1, a surface that faces the sun sees (1 + height) / 2
+        direct = self.share / (1 - self.share) * (1 + height) / 2
+        ground = _ALBEDO * (1 + direct * height)
+        whole = direct + (1 + height) / 2 + ground * (1 - height) / 2
+        return direct / whole, 1 / whole, ground / whole
 
 
 def black_body(temperature_k: float) -> np.ndarray:

@@ -297,5 +297,7 @@ def _nearest(known: np.ndarray, counts: tuple[int, ...]) -> np.ndarray:
     from scipy import ndimage  # slow to import
 
     grid = ~known.reshape(counts[::-1])
-    _, places = ndimage.distance_transform_edt(grid, return_indices=True)
-    return np.ravel_multi_index(list(places), grid.shape).ravel()
+    found: Any = ndimage.distance_transform_edt(
+        grid, return_distances=False, return_indices=True
+    )
+    return np.ravel_multi_index(list(found), grid.shape).ravel()
