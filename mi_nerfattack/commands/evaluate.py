@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from mi_nerfattack.evaluation.evaluate import EvaluateSettings
     from mi_nerfattack.evaluation.identity import EnvironmentUnder
     from mi_nerfattack.evaluation.work import EvaluateDrives, Evaluation
-    from mi_nerfattack.scenario.policy.kinds import AbstractPolicySection
+    from mi_nerfattack.scenario.policy.base import AbstractPolicySection
     from mi_nerfattack.system.workers import AbstractWorkers
     from mi_nerfattack.training.record import TrainingRecord
     from mi_nerfattack.vehicle.route.route import Route

@@ -12,7 +12,7 @@ from mi_nerfattack.drives import spec
 from mi_nerfattack.evaluation.evaluate import EvaluateSettings
 from mi_nerfattack.io.resumable import json_digest
 from mi_nerfattack.scenario.named_file import section_content
-from mi_nerfattack.scenario.policy.kinds import AbstractPolicySection
+from mi_nerfattack.scenario.policy.base import AbstractPolicySection
 from mi_nerfattack.scenario.vehicle import AbstractVehicleSection
 from mi_nerfattack.vehicle.route.route import Route
 

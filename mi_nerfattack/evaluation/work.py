@@ -38,7 +38,7 @@ from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.rollout.drive import EXPERT, NO_OBJECT, Drive, departure_limits
 from mi_nerfattack.rollout.loop import OnStep
 from mi_nerfattack.scenario.named_file import section_content
-from mi_nerfattack.scenario.policy.kinds import AbstractPolicySection
+from mi_nerfattack.scenario.policy.base import AbstractPolicySection
 from mi_nerfattack.scenario.vehicle import AbstractVehicleSection
 from mi_nerfattack.system.workers import AbstractWorkers, InThisProcess
 from mi_nerfattack.vehicle.expert import expert_for

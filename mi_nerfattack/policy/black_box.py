@@ -17,7 +17,7 @@ from mi_nerfattack.policy.checks import check_images, expand_goals
 from mi_nerfattack.policy.inputs import GOAL, Inputs
 from mi_nerfattack.policy.preprocess import Preprocess
 
-DIFFERENTIABLE_KINDS = "pilotnet, module, exported, torchscript, onnx, drjit"
+DIFFERENTIABLE_KINDS = "pilotnet, module, exported, torchscript, onnx, openpilot, drjit"
 
 
 class AbstractBlackBox(AbstractPolicy):

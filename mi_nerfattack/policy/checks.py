@@ -79,7 +79,7 @@ def columns_of(
     if count == 1 and values.ndim < 2:  # a network that drops axes of size 1
         values = values.reshape(1, -1)
     shape = tuple(values.shape)
-    if shape != (count,):
+    if shape != (count,) or isinstance(output, Sequence):
         column = 0 if output is None and shape == (count, 1) else output
         most = max(column) if isinstance(column, Sequence) else column
         if len(shape) != 2 or shape[0] != count or most is None or most >= shape[1]:
@@ -217,7 +217,7 @@ def check_alone(
     """Refuse a network whose control for one image depends on the rest of the batch.
 
     Args:
-        evaluate: gives the controls (n,) of the first n of two images.
+        evaluate: gives the controls (n,) or (n, k) of the first n of two images.
         name: for messages.
         least: difference that rounding explains.
 
@@ -226,14 +226,15 @@ def check_alone(
     """
     try:
         with torch.no_grad():
-            (alone,), both = evaluate(1).tolist(), evaluate(2).tolist()
+            alone, both = evaluate(1).reshape(1, -1), evaluate(2).reshape(2, -1)
     except InputError:  # it takes batches of another size, and will tell of them
         return
-    scale = max(abs(alone), abs(both[1]), abs(both[1] - both[0]))
-    if abs(both[0] - alone) > MIXED * scale + least:
-        raise InputError(
-            f"{name}: the control for one image is {alone:.6g} alone and "
-            f"{both[0]:.6g} in a batch with another image, so vehicles would influence "
-            "each other; batch statistics do that: export network.eval(), and give "
-            "normalisation layers running statistics"
-        )
+    for one, first, second in torch.cat([alone, both]).T.tolist():
+        scale = max(abs(one), abs(second), abs(second - first))
+        if abs(first - one) > MIXED * scale + least:
+            raise InputError(
+                f"{name}: the control for one image is {one:.6g} alone and {first:.6g} "
+                "in a batch with another image, so vehicles would influence each "
+                "other; batch statistics do that: export network.eval(), and give "
+                "normalisation layers running statistics"
+            )

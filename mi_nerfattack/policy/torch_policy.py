@@ -267,10 +267,8 @@ class TorchPolicy(AbstractPolicy):
                 def evaluate(count: int) -> torch.Tensor:
                     hidden = (torch.cat([part] * count, axis) for part, axis in parts)
                     told = None if one is None else one.expand(count, -1)
-                    found, _ = self._evaluate(
-                        pair[:count], goals.expand(count), tuple(hidden), told
-                    )
-                    return found if found.ndim == 1 else found[:, 0]
+                    several = goals.expand(count)
+                    return self._evaluate(pair[:count], several, tuple(hidden), told)[0]
 
                 scale = self.action.scale
                 largest = max(map(abs, scale if isinstance(scale, tuple) else (scale,)))

@@ -12,7 +12,7 @@ import json
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
@@ -203,6 +203,7 @@ class Scenario(Section):
     attack: AttackSection = AttackSection()
     baseline: BaselineSection = BaselineSection()
     deployment: DeploymentSections = RenderedDeployment()
+    later: ClassVar[tuple[str, ...]] = ("cameras",)
 
     def __repr__(self) -> str:
         return (

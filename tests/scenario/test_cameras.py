@@ -44,10 +44,10 @@ RIG = Rig(
 )
 #: Turns to where it is brighter: to the left, or ahead.
 BRIGHTER = """
-def drive(image, goal, step):
-    front, left = image[:, :, :10, :24], image[:, :, :, 24:]
-    if front.shape != (len(image), 3, 10, 24) or left.shape != (len(image), 3, 12, 16):
-        raise ValueError(f"{image.shape}")
+def drive(front, left, goal, step):
+    shapes = front.shape[1:], left.shape[1:]
+    if shapes != ((3, 10, 24), (3, 12, 16)):
+        raise ValueError(f"{front.shape}, {left.shape}")
     return [float(b.mean() - a.mean()) for a, b in zip(front, left)]
 """
 
@@ -118,12 +118,13 @@ class Two(torch.nn.Module):
     def __init__(self):
         super().__init__()
         generator = torch.Generator().manual_seed(3)
-        self.weight = torch.nn.Parameter(
-            0.02 * torch.randn(1, 3, 12, 40, generator=generator)
-        )
+        sizes = (10, 24), (12, 16)
+        weights = [torch.randn(1, 3, *size, generator=generator) for size in sizes]
+        self.weights = torch.nn.ParameterList(0.02 * weight for weight in weights)
 
-    def forward(self, image, goal):
-        return torch.tanh((image * self.weight).sum((1, 2, 3)))
+    def forward(self, front, left, goal):
+        pairs = zip((front, left), self.weights)
+        return torch.tanh(sum((image * w).sum((1, 2, 3)) for image, w in pairs))
 """
 CHANGES = {
     '[policy]\nfile = "policy.safetensors"\n': """[policy]

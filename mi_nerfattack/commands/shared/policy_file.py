@@ -12,7 +12,7 @@ from mi_nerfattack.errors import InputError
 if TYPE_CHECKING:
     from mi_nerfattack.deploy.place import Place
     from mi_nerfattack.render.camera.rig import Rig
-    from mi_nerfattack.scenario.policy.kinds import AbstractPolicySection
+    from mi_nerfattack.scenario.policy.base import AbstractPolicySection
     from mi_nerfattack.scenario.scenario import Scenario
     from mi_nerfattack.scenario.vehicle import AbstractVehicleSection
 

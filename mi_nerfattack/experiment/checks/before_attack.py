@@ -201,6 +201,18 @@ def unit_findings(world: World) -> Iterator[str]:
         )
 
 
+def period_findings(world: World) -> Iterator[str]:
+    """Tell of another control period than the policy was trained with."""
+    policy, period = world.scenario.policy, world.scenario.vehicle.dt_s
+    if policy.period_s is not None and not np.isclose(policy.period_s, period):
+        yield (
+            f"vehicle.dt_s: {period:g} s; {policy.source} was trained with "
+            f"{policy.period_s:g} s between two images: give vehicle.dt_s = "
+            f"{policy.period_s:g}, or policy.stride and policy.frame_stride of the "
+            "same times"
+        )
+
+
 def horizon_findings(world: World, first: Drive) -> Iterator[str]:
     """Tell of a horizon that an open route is too short for."""
     route = world.route

@@ -30,6 +30,7 @@ from mi_nerfattack.experiment.checks.before_attack import (
     further_findings,
     likeness_findings,
     mesh_scene,
+    period_findings,
     place_findings,
     route_findings,
     speed_findings,
@@ -82,7 +83,11 @@ class Check:
         """
         world = self.world
         departure_limit(world.route.lane_width_m, world.scenario.vehicle.width_m)
-        self.doubts += [*unit_findings(world), *speed_findings(world)]
+        self.doubts += [
+            *unit_findings(world),
+            *speed_findings(world),
+            *period_findings(world),
+        ]
         try:
             if drives:
                 self._told(self._drive)

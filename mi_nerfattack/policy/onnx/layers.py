@@ -15,8 +15,14 @@ from mi_nerfattack.policy.onnx.call import Call, Operator
 from mi_nerfattack.policy.onnx.resize import resize
 
 _CONVOLUTIONS = {1: functional.conv1d, 2: functional.conv2d, 3: functional.conv3d}
+_TRANSPOSED = {
+    1: functional.conv_transpose1d,
+    2: functional.conv_transpose2d,
+    3: functional.conv_transpose3d,
+}
 _MAX_POOLS = {1: functional.max_pool1d, 2: functional.max_pool2d}
 _AVERAGE_POOLS = {1: functional.avg_pool1d, 2: functional.avg_pool2d}
+_GRID_MODES = {"linear": "bilinear", "bilinear": "bilinear", "nearest": "nearest"}
 _PAD_MODES = {"constant": "constant", "reflect": "reflect", "edge": "replicate"}
 
 
@@ -32,6 +38,30 @@ def convolve(call: Call) -> torch.Tensor:
     return _CONVOLUTIONS[axes](
         x, weight, call.get(2), strides, 0, list(dilations), group
     )
+
+
+def convolve_transposed(call: Call) -> torch.Tensor:
+    """ConvTranspose: padding cuts the result, and output_padding enlarges it."""
+    weight, bias = call.need(1), call.get(2)
+    axes, sizes = weight.ndim - 2, call.x.shape[2:]
+    strides = list(call.attribute("strides", [1] * axes))
+    dilations = list(call.attribute("dilations", [1] * axes))
+    more = list(call.attribute("output_padding", [0] * axes))
+    group = call.attribute("group", 1)
+    whole = _TRANSPOSED[axes](call.x, weight, None, strides, 0, 0, group, dilations)
+    pads = list(call.attribute("pads", [0] * 2 * axes))
+    rule, wanted = call.attribute("auto_pad", "NOTSET"), call.attribute("output_shape")
+    if wanted is None and rule.startswith("SAME"):
+        wanted = [size * stride for size, stride in zip(sizes, strides, strict=True)]
+    for i, size in enumerate(wanted or ()):
+        total = whole.shape[2 + i] + more[i] - size
+        before = total // 2 if rule == "SAME_UPPER" else total - total // 2
+        pads[i], pads[i + axes] = before, total - before
+    flat = []
+    for i in reversed(range(axes)):
+        flat += [-pads[i], more[i] - pads[i + axes]]
+    result = functional.pad(whole, flat)
+    return result if bias is None else result + bias.reshape(-1, *[1] * axes)
 
 
 def max_pool(call: Call) -> torch.Tensor:
@@ -77,6 +107,54 @@ def layer_normalise(call: Call) -> torch.Tensor:
     shape = call.x.shape[call.attribute("axis", -1) :]
     epsilon = call.attribute("epsilon", 1e-5)
     return functional.layer_norm(call.x, shape, call.need(1), call.get(2), epsilon)
+
+
+def instance_normalise(call: Call) -> torch.Tensor:
+    """InstanceNormalization: each channel of each image by itself."""
+    epsilon = call.attribute("epsilon", 1e-5)
+    return functional.instance_norm(
+        call.x, weight=call.need(1), bias=call.need(2), eps=epsilon
+    )
+
+
+def group_normalise(call: Call) -> torch.Tensor:
+    """GroupNormalization; before version 21 with a scale and a bias for each group."""
+    groups, scale, bias = call.attribute("num_groups"), call.need(1), call.need(2)
+    if call.opset < 21:
+        repeat = call.x.shape[1] // groups
+        scale = scale.repeat_interleave(repeat)
+        bias = bias.repeat_interleave(repeat)
+    epsilon = call.attribute("epsilon", 1e-5)
+    return functional.group_norm(call.x, groups, scale, bias, epsilon)
+
+
+def unit_normalise(call: Call) -> torch.Tensor:
+    """LpNormalization: divide by the norm along an axis, 0 where it is 0."""
+    axis, order = call.attribute("axis", -1), call.attribute("p", 2)
+    norm = call.x.norm(order, axis, keepdim=True)
+    return call.x / torch.where(norm == 0, torch.ones_like(norm), norm)
+
+
+def mean_variance_normalise(call: Call) -> torch.Tensor:
+    """MeanVarianceNormalization, over the image and the batch by default."""
+    axes = list(call.attribute("axes", [0, 2, 3]))
+    centred = call.x - call.x.mean(axes, keepdim=True)
+    return centred / (centred.square().mean(axes, keepdim=True).sqrt() + 1e-9)
+
+
+def sample(call: Call) -> torch.Tensor:
+    """GridSample: read images at places in [-1, 1]."""
+    mode = call.attribute("mode", "bilinear")
+    if mode not in _GRID_MODES or call.x.ndim != 4:
+        raise InputError(
+            f"GridSample: mode {mode!r} of {call.x.ndim} axes is not supported; "
+            f"{' and '.join(_GRID_MODES)} of 4 axes are"
+        )
+    padding = call.attribute("padding_mode", "zeros")
+    align = bool(call.attribute("align_corners", 0))
+    return functional.grid_sample(
+        call.x, call.need(1), _GRID_MODES[mode], padding, align
+    )
 
 
 def global_average(call: Call) -> torch.Tensor:
@@ -144,10 +222,16 @@ LAYERS: dict[str, Operator] = {
     "AveragePool": average_pool,
     "BatchNormalization": batch_normalise,
     "Conv": convolve,
+    "ConvTranspose": convolve_transposed,
     "GlobalAveragePool": global_average,
     "GlobalMaxPool": global_maximum,
+    "GridSample": sample,
+    "GroupNormalization": group_normalise,
+    "InstanceNormalization": instance_normalise,
     "LayerNormalization": layer_normalise,
+    "LpNormalization": unit_normalise,
     "MaxPool": max_pool,
+    "MeanVarianceNormalization": mean_variance_normalise,
     "Pad": pad,
     "Resize": resize,
     "Upsample": resize,

@@ -121,10 +121,11 @@ class OnnxNetwork(torch.nn.Module):
         batch: the number of images that it takes, None where any.
     """
 
-    def __init__(self, model: Any, name: str) -> None:
-        """Take a ``ModelProto`` apart; `name` is for messages."""
+    def __init__(self, model: Any, name: str, rounds: bool = False) -> None:
+        """Take a ``ModelProto`` apart; see `load_onnx`, `name` is for messages."""
         super().__init__()
         self.name = name
+        self.rounds = rounds
         self.opset: int = _opset(model, name)
         graph = model.graph
         self.whole: dict[str, torch.Tensor] = {}
@@ -242,9 +243,20 @@ class OnnxNetwork(torch.nn.Module):
                     f"{list(value.shape)}: set policy.goal and policy.recurrent"
                 )
         return {
-            item.name: value.to(torch.int64 if item.whole else dtype)
+            item.name: self._converted(item, value, dtype)
             for item, value in zip(self.inputs, arguments, strict=True)
         }
+
+    def _converted(
+        self, item: Input, value: torch.Tensor, dtype: torch.dtype
+    ) -> torch.Tensor:
+        """Return an argument in the type of its input."""
+        if not item.whole:
+            return value.to(dtype)
+        if self.rounds and value.is_floating_point():
+            value = value.to(dtype)
+            return value + (value.detach().round() - value.detach())
+        return value.to(torch.int64)
 
     def _read_constants(self, graph: Any, nodes: list[Node]) -> None:
         """Keep initial values: floating ones as buffers, others on the CPU."""
@@ -265,8 +277,13 @@ class OnnxNetwork(torch.nn.Module):
                 self.whole[name] = value
 
 
-def load_onnx(path: Path) -> OnnxNetwork:
+def load_onnx(path: Path, rounds: bool = False) -> OnnxNetwork:
     """Read an ``.onnx`` file with its weights inside.
+
+    Args:
+        path: of the file.
+        rounds: accept images of integers. They are given as floating numbers, which
+            are rounded; the derivative of the rounding is taken as 1.
 
     Raises:
         InputError: no such file, another format, weights in other files, or operators
@@ -291,8 +308,8 @@ def load_onnx(path: Path) -> OnnxNetwork:
             f"{path}: keeps {outside[0]!r} in another file; save it with the weights "
             "inside: onnx.save(onnx.load(FILE), FILE)"
         )
-    network = OnnxNetwork(model, str(path))
-    if network.inputs[0].whole:
+    network = OnnxNetwork(model, str(path), rounds)
+    if network.inputs[0].whole and not rounds:
         raise InputError(
             f"{path}: input {network.inputs[0].name!r}, the image, is of integers, "
             "which have no derivative; export the network with a float input, and "

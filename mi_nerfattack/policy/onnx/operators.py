@@ -14,6 +14,7 @@ from torch.nn import functional
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.onnx.call import Call, Operator
+from mi_nerfattack.policy.onnx.indexing import INDEXING
 from mi_nerfattack.policy.onnx.layers import LAYERS
 from mi_nerfattack.policy.onnx.recurrent import RECURRENT
 
@@ -81,6 +82,33 @@ def softmax(call: Call) -> torch.Tensor:
     return call.x.flatten(axis).softmax(-1).reshape(call.x.shape)
 
 
+def log_softmax(call: Call) -> torch.Tensor:
+    """LogSoftmax; before version 13 over all axes from `axis` on."""
+    if call.opset >= 13:
+        return call.x.log_softmax(call.attribute("axis", -1))
+    axis = call.attribute("axis", 1) % call.x.ndim
+    return call.x.flatten(axis).log_softmax(-1).reshape(call.x.shape)
+
+
+def modulo(call: Call) -> torch.Tensor:
+    """Mod, with the sign of the divisor, or with fmod that of the dividend."""
+    return (torch.fmod if call.attribute("fmod", 0) else torch.remainder)(
+        call.x, call.need(1)
+    )
+
+
+def einsum(call: Call) -> torch.Tensor:
+    """Einsum."""
+    parts = [call.need(i) for i in range(len(call.inputs))]
+    return torch.einsum(call.attribute("equation"), *parts)
+
+
+def mean(call: Call) -> torch.Tensor:
+    """Mean of any number of inputs."""
+    parts = [call.need(i) for i in range(len(call.inputs))]
+    return reduce(torch.add, parts) / len(parts)
+
+
 def gelu(call: Call) -> torch.Tensor:
     """Gelu, exact or by tanh."""
     return functional.gelu(call.x, approximate=call.attribute("approximate", "none"))
@@ -94,6 +122,11 @@ def cast(call: Call) -> torch.Tensor:
     if target not in _WHOLE_TYPES:
         raise InputError(f"Cast: to element type {target} is not supported")
     return call.x.to(_WHOLE_TYPES[target])
+
+
+def cast_like(call: Call) -> torch.Tensor:
+    """CastLike: to the type of the second input."""
+    return call.x.to(call.need(1).dtype)
 
 
 def shape(call: Call) -> torch.Tensor:
@@ -162,42 +195,6 @@ def split(call: Call) -> tuple[torch.Tensor, ...]:
     return call.x.split(sizes, axis)
 
 
-def slices(call: Call) -> torch.Tensor:
-    """Slice; a negative step turns an axis round."""
-    starts, ends = call.integers(1, "starts") or [], call.integers(2, "ends") or []
-    axes = call.integers(3, "axes") or list(range(len(starts)))
-    steps = call.integers(4, "steps") or [1] * len(starts)
-    x = call.x
-    for start, end, axis, step in zip(starts, ends, axes, steps, strict=True):
-        chosen = range(x.shape[axis])[start:end:step]
-        if step == 1:
-            x = x.narrow(axis, chosen.start, len(chosen))
-            continue
-        index = torch.arange(len(chosen), device=x.device)
-        x = x.index_select(axis, chosen.start + step * index)
-    return x
-
-
-def gather(call: Call) -> torch.Tensor:
-    """Gather: whole slices by index along an axis."""
-    axis, index = call.attribute("axis", 0), call.need(1).to(call.x.device)
-    axis, size = axis % call.x.ndim, call.x.shape[axis]
-    index = torch.where(index < 0, index + size, index).to(torch.int64)
-    result = call.x.index_select(axis, index.flatten())
-    return result.reshape(call.x.shape[:axis] + index.shape + call.x.shape[axis + 1 :])
-
-
-def one_hot(call: Call) -> torch.Tensor:
-    """OneHot: the second value at the index, the first elsewhere."""
-    depth, values = int(call.need(1)), call.need(2).to(call.x.device)
-    index = call.x.to(torch.int64)
-    index = torch.where(index < 0, index + depth, index).unsqueeze(-1)
-    hot = index == torch.arange(depth, device=index.device)
-    return torch.where(hot, values[1], values[0]).movedim(
-        -1, call.attribute("axis", -1)
-    )
-
-
 def squeeze(call: Call) -> torch.Tensor:
     """Squeeze given axes, or all of size one."""
     axes = call.integers(1, "axes")
@@ -233,6 +230,34 @@ def _reduction(function: Callable[..., torch.Tensor]) -> Operator:
     return run
 
 
+def _product(x: torch.Tensor, axes: list[int], keepdim: bool) -> torch.Tensor:
+    for axis in sorted((axis % x.ndim for axis in axes), reverse=True):
+        x = x.prod(axis, keepdim)
+    return x
+
+
+def _sum_of(
+    inner: Callable[[torch.Tensor], torch.Tensor],
+    outer: Callable[[torch.Tensor], torch.Tensor] | None = None,
+) -> Operator:
+    """Make an operator that reduces by a sum of functions, or a function of it."""
+
+    def run(x: torch.Tensor, axes: list[int], keepdim: bool) -> torch.Tensor:
+        total = inner(x).sum(axes, keepdim)
+        return total if outer is None else outer(total)
+
+    return _reduction(run)
+
+
+def _celu(call: Call) -> torch.Tensor:
+    return functional.celu(call.x, call.attribute("alpha", 1.0))
+
+
+def _thresholded(call: Call) -> torch.Tensor:
+    above = call.x > call.attribute("alpha", 1.0)
+    return torch.where(above, call.x, torch.zeros_like(call.x))
+
+
 def _elu(call: Call) -> torch.Tensor:
     return functional.elu(call.x, call.attribute("alpha", 1.0))
 
@@ -251,49 +276,84 @@ def _where(call: Call) -> torch.Tensor:
 
 VALUES: dict[str, Operator] = {
     "Abs": _one(torch.abs),
+    "Acos": _one(torch.acos),
+    "Acosh": _one(torch.acosh),
     "Add": _many(torch.add),
+    "And": _many(torch.logical_and),
+    "Asin": _one(torch.asin),
+    "Asinh": _one(torch.asinh),
+    "Atan": _one(torch.atan),
+    "Atanh": _one(torch.atanh),
     "Cast": cast,
+    "CastLike": cast_like,
+    "Ceil": _one(torch.ceil),
+    "Celu": _celu,
     "Clip": clip,
     "Cos": _one(torch.cos),
+    "Cosh": _one(torch.cosh),
     "Div": _many(_divide),
     "Dropout": _one(lambda x: x),
+    "Einsum": einsum,
     "Elu": _elu,
     "Equal": _many(torch.eq),
     "Erf": _one(torch.erf),
     "Exp": _one(torch.exp),
+    "Floor": _one(torch.floor),
     "Gelu": gelu,
     "Gemm": gemm,
     "Greater": _many(torch.gt),
+    "GreaterOrEqual": _many(torch.ge),
     "HardSigmoid": hard_sigmoid,
     "HardSwish": _one(functional.hardswish),
     "Identity": _one(lambda x: x),
+    "IsInf": _one(torch.isinf),
+    "IsNaN": _one(torch.isnan),
     "LeakyRelu": _leaky_relu,
     "Less": _many(torch.lt),
+    "LessOrEqual": _many(torch.le),
     "Log": _one(torch.log),
+    "LogSoftmax": log_softmax,
     "MatMul": _many(torch.matmul),
     "Max": _many(torch.maximum),
+    "Mean": mean,
     "Min": _many(torch.minimum),
+    "Mish": _one(functional.mish),
+    "Mod": modulo,
     "Mul": _many(torch.mul),
     "Neg": _one(torch.neg),
+    "Not": _one(torch.logical_not),
+    "Or": _many(torch.logical_or),
     "PRelu": _prelu,
     "Pow": _many(torch.pow),
     "Reciprocal": _one(torch.reciprocal),
+    "ReduceL1": _sum_of(torch.abs),
+    "ReduceL2": _sum_of(torch.square, torch.sqrt),
+    "ReduceLogSum": _sum_of(lambda x: x, torch.log),
+    "ReduceLogSumExp": _reduction(torch.logsumexp),
     "ReduceMax": _reduction(torch.amax),
     "ReduceMean": _reduction(torch.mean),
     "ReduceMin": _reduction(torch.amin),
+    "ReduceProd": _reduction(_product),
     "ReduceSum": _reduction(torch.sum),
+    "ReduceSumSquare": _sum_of(torch.square),
     "Relu": _one(torch.relu),
+    "Round": _one(torch.round),
     "Selu": _one(torch.selu),
     "Sigmoid": _one(torch.sigmoid),
+    "Sign": _one(torch.sign),
     "Sin": _one(torch.sin),
+    "Sinh": _one(torch.sinh),
     "Softmax": softmax,
     "Softplus": _one(functional.softplus),
     "Softsign": _one(functional.softsign),
     "Sqrt": _one(torch.sqrt),
     "Sub": _many(torch.sub),
     "Sum": _many(torch.add),
+    "Tan": _one(torch.tan),
     "Tanh": _one(torch.tanh),
+    "ThresholdedRelu": _thresholded,
     "Where": _where,
+    "Xor": _many(torch.logical_xor),
 }
 SHAPES: dict[str, Operator] = {
     "Concat": concat,
@@ -301,14 +361,12 @@ SHAPES: dict[str, Operator] = {
     "ConstantOfShape": constant_of_shape,
     "Expand": expand,
     "Flatten": flatten,
-    "Gather": gather,
-    "OneHot": one_hot,
     "Reshape": reshape,
     "Shape": shape,
-    "Slice": slices,
+    "Size": lambda call: torch.tensor(call.x.numel()),
     "Split": split,
     "Squeeze": squeeze,
     "Transpose": transpose,
     "Unsqueeze": unsqueeze,
 }
-OPERATORS: dict[str, Operator] = {**VALUES, **SHAPES, **LAYERS, **RECURRENT}
+OPERATORS: dict[str, Operator] = {**VALUES, **SHAPES, **INDEXING, **LAYERS, **RECURRENT}

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Mapping, MutableMapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field, model_validator
 
 from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.io.network import read_token
-from mi_nerfattack.policy.action import Action
-from mi_nerfattack.policy.base import AbstractPolicy, Numbers
+from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.policy.black_box import DIFFERENTIABLE_KINDS, CallablePolicy
 from mi_nerfattack.policy.drjit_network import DrJitNetwork
 from mi_nerfattack.policy.exported import load_exported, load_torchscript
 from mi_nerfattack.policy.http.policy import HttpPolicy
 from mi_nerfattack.policy.inputs import (
-    Inputs,
     IntegerGoal,
     NoGoal,
     OneHotGoal,
@@ -31,20 +28,9 @@ from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.policy.weights import load_drjit_state, load_state
 from mi_nerfattack.ranges import Positive, Whole
 from mi_nerfattack.scenario.named_file import Code, File
-from mi_nerfattack.scenario.policy.parts import (
-    NonZero,
-    PreprocessSection,
-    TrajectorySection,
-)
-from mi_nerfattack.scenario.section import (
-    Kinds,
-    OneOrSeveral,
-    Section,
-    Trust,
-    Unit,
-    read_section,
-    refuse,
-)
+from mi_nerfattack.scenario.policy.base import NO_VIEWS, AbstractPolicySection, Views
+from mi_nerfattack.scenario.policy.openpilot import OpenpilotSection
+from mi_nerfattack.scenario.section import Kinds, OneOrSeveral, read_section, refuse
 from mi_nerfattack.scenario.user_code import check_trust
 
 #: Kinds by the suffix of the file.
@@ -55,85 +41,7 @@ SUFFIXES = {
     ".pt": "torchscript",
     ".onnx": "onnx",
 }
-
-
 Shapes = tuple[tuple[int, ...], ...]
-Views = Mapping[str, tuple[slice, slice]]
-NO_VIEWS: Views = {}
-
-
-class AbstractPolicySection(Section):
-    """What describes every policy."""
-
-    #: To rad/s (dubins) or rad, positive to the left; of several controls one each.
-    control_scale: OneOrSeveral[NonZero] = 1.0
-    #: After `control_scale`; results do not depend on this key.
-    control_unit: Annotated[Unit | None, Field(exclude=True)] = None
-    #: Column of the control, where there are several; or columns of several.
-    output: OneOrSeveral[Whole] | None = None
-    #: What the policy is given, in its order: image or names of cameras, speed, route,
-    #: time, goal; by default images and goal.
-    inputs: tuple[str, ...] = ()
-    route_m: tuple[Positive, ...] = ()  # of the points of "route"
-    trajectory: TrajectorySection | None = None
-    preprocess: PreprocessSection = PreprocessSection()
-    trust_code: Trust = False  # of files that are code: they run with all rights
-
-    later: ClassVar[tuple[str, ...]] = ("inputs", "route_m", "trajectory")
-
-    @property
-    def source(self) -> str:
-        """The file or URL, as it is given."""
-        return next(str(v) for (key, *_), v in self.leaves() if key in ("file", "url"))
-
-    def unit(self) -> str | None:
-        """Return the unit of the first control; None where nothing says it."""
-        return self.control_unit if self.trajectory is None else self.trajectory.unit
-
-    @abstractmethod
-    def build(self, views: Views = NO_VIEWS) -> AbstractPolicy:
-        """Make the policy.
-
-        Args:
-            views: rows and columns of each camera's image in the frame, by its name;
-                by default the frame is the only image.
-
-        Raises:
-            InputError: a file is missing or wrong, or is code without the word of
-                trust, or a package that the kind needs is not installed.
-        """
-
-    def action(self) -> Action:
-        """Return what the policy's answer means."""
-        follower = None if self.trajectory is None else self.trajectory.build()
-        return Action(self.columns, self.control_scale, follower)
-
-    @property
-    def columns(self) -> int | tuple[int, ...] | None:
-        """Columns of the controls in the answer."""
-        return self.output
-
-    def given(self, views: Views) -> Inputs:
-        """Return what the policy is given; `views` as of :meth:`build`."""
-        speed = "speed" in self.inputs or self.trajectory is not None
-        numbers = Numbers(speed, self.route_m, "time" in self.inputs)
-        return Inputs(self.inputs, numbers, views)
-
-    @model_validator(mode="after")
-    def _check_parts(self) -> Any:
-        """Refuse points that are not told, or told without distances."""
-        if ("route" in self.inputs) != bool(self.route_m):
-            refuse(
-                "route_m",
-                'arc lengths to points ahead, metres, go with "route" among inputs',
-            )
-        if self.trajectory is not None and self.control_unit is not None:
-            refuse("control_unit", "trajectory.controls says it; leave it out")
-        try:
-            self.action()
-        except InputError as error:
-            refuse("output", str(error))
-        return self
 
 
 class AbstractNetworkSection(AbstractPolicySection):
@@ -365,6 +273,7 @@ PolicySection = Annotated[
     PilotNetSection
     | ModuleSection
     | ProgramSection
+    | OpenpilotSection
     | DrJitSection
     | CallableSection
     | HttpSection,

@@ -7,7 +7,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.action import Axes, Trajectory
 from mi_nerfattack.policy.preprocess import (
     FILTERS,
@@ -84,7 +83,7 @@ class PreprocessSection(Section):
 class TrajectorySection(Section):
     """The policy gives positions over time, which are followed; see `Trajectory`."""
 
-    times_s: Annotated[tuple[Positive, ...], Field(min_length=1)]
+    times_s: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = None
     controls: tuple[Literal["heading_rate", "steering", "acceleration"], ...] = (
         "heading_rate",
     )
@@ -95,21 +94,13 @@ class TrajectorySection(Section):
     speed_gain: Positive = 1.0  # 1 / s
     axes: Axes = "forward_left"
 
-    def build(self) -> Trajectory:
-        """Make it."""
-        return Trajectory(
-            **{key: getattr(self, key) for key in type(self).model_fields}
-        )
+    def build(self, own_times_s: tuple[float, ...] = ()) -> Trajectory:
+        """Make it; a kind of policy with times of its own gives them."""
+        keys = {key: getattr(self, key) for key in type(self).model_fields}
+        keys["times_s"] = self.times_s or own_times_s
+        return Trajectory(**keys)
 
     @property
     def unit(self) -> str:
         """Unit of the first control."""
         return "rad/s" if self.controls[0] == "heading_rate" else "rad"
-
-    @model_validator(mode="after")
-    def _check(self) -> Any:
-        try:
-            self.build()
-        except InputError as error:
-            refuse("times_s", str(error))
-        return self

@@ -243,5 +243,5 @@ def test_a_car_drives_over_what_is_low(found, monkeypatch):
 def test_a_second_process_is_refused_before_it_attacks_anew(tmp_path):
     nothing: Any = None
     with locks.exclusive(tmp_path), pytest.raises(InputError, match="another process"):
-        attack_anew([], Path("absent"), tmp_path, nothing)
+        attack_anew([], "policy.file=absent", tmp_path, nothing)
     assert not list(tmp_path.iterdir())

@@ -1,0 +1,119 @@
+"""What every kind of the section ``[policy]`` has, whatever its file."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
+
+from pydantic import Field, model_validator
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.policy.action import Action, Trajectory
+from mi_nerfattack.policy.base import AbstractPolicy, Numbers
+from mi_nerfattack.policy.inputs import Inputs
+from mi_nerfattack.ranges import Positive, Whole
+from mi_nerfattack.scenario.policy.parts import (
+    NonZero,
+    PreprocessSection,
+    TrajectorySection,
+)
+from mi_nerfattack.scenario.section import OneOrSeveral, Section, Trust, Unit, refuse
+
+Views = Mapping[str, tuple[slice, slice]]
+NO_VIEWS: Views = {}
+
+
+class AbstractPolicySection(Section):
+    """What describes every policy."""
+
+    #: To rad/s (dubins) or rad, positive to the left; of several controls one each.
+    control_scale: OneOrSeveral[NonZero] = 1.0
+    #: After `control_scale`; results do not depend on this key.
+    control_unit: Annotated[Unit | None, Field(exclude=True)] = None
+    #: Column of the control, where there are several; or columns of several.
+    output: OneOrSeveral[Whole] | None = None
+    #: What the policy is given, in its order: image or names of cameras, speed, route,
+    #: time, goal; by default images and goal.
+    inputs: tuple[str, ...] = ()
+    route_m: tuple[Positive, ...] = ()  # of the points of "route"
+    trajectory: TrajectorySection | None = None
+    preprocess: PreprocessSection = PreprocessSection()
+    trust_code: Trust = False  # of files that are code: they run with all rights
+
+    later: ClassVar[tuple[str, ...]] = ("inputs", "route_m", "trajectory")
+    #: Times of the positions that the kind itself gives, seconds; () where none.
+    own_times_s: ClassVar[tuple[float, ...]] = ()
+    #: Control period that the kind was trained with, seconds; None where any will do.
+    period_s: ClassVar[float | None] = None
+
+    @property
+    def source(self) -> str:
+        """The file or URL, as it is given."""
+        return next(str(v) for (key, *_), v in self.leaves() if key in ("file", "url"))
+
+    def unit(self) -> str | None:
+        """Return the unit of the first control; None where nothing says it."""
+        return self.control_unit if self.trajectory is None else self.trajectory.unit
+
+    @abstractmethod
+    def build(self, views: Views = NO_VIEWS) -> AbstractPolicy:
+        """Make the policy.
+
+        Args:
+            views: rows and columns of each camera's image in the frame, by its name;
+                by default the frame is the only image.
+
+        Raises:
+            InputError: a file is missing or wrong, or is code without the word of
+                trust, or a package that the kind needs is not installed.
+        """
+
+    def action(self) -> Action:
+        """Return what the policy's answer means."""
+        return Action(self.columns, self.control_scale, self._follower())
+
+    @property
+    def columns(self) -> int | tuple[int, ...] | None:
+        """Columns of the controls in the answer."""
+        return self.output
+
+    def _follower(self) -> Trajectory | None:
+        times, section = self.own_times_s, self.trajectory
+        return None if section is None else section.build(times)
+
+    def given(self, views: Views) -> Inputs:
+        """Return what the policy is given; `views` as of :meth:`build`."""
+        speed = "speed" in self.inputs or self.trajectory is not None
+        numbers = Numbers(speed, self.route_m, "time" in self.inputs)
+        return Inputs(self.inputs, numbers, views)
+
+    @model_validator(mode="after")
+    def _check_parts(self) -> Any:
+        """Refuse points that are not told, or told without distances."""
+        if ("route" in self.inputs) != bool(self.route_m):
+            refuse(
+                "route_m",
+                'arc lengths to points ahead, metres, go with "route" among inputs',
+            )
+        if self.trajectory is not None and self.control_unit is not None:
+            refuse("control_unit", "trajectory.controls says it; leave it out")
+        self._check_trajectory()
+        try:
+            self.action()
+        except InputError as error:
+            refuse("output", str(error))
+        return self
+
+    def _check_trajectory(self) -> None:
+        """Refuse a trajectory without times, with those of another, or a wrong one."""
+        if self.trajectory is None:
+            return
+        if self.trajectory.times_s is None and not self.own_times_s:
+            refuse("trajectory.times_s", "is missing")
+        if self.trajectory.times_s is not None and self.own_times_s:
+            refuse("trajectory.times_s", "the policy has its own times; leave it out")
+        try:
+            self._follower()
+        except InputError as error:
+            refuse("trajectory", str(error))
