@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from mi_nerfattack.deploy.environment import AbstractEnvironment
+from mi_nerfattack.deploy.vehicle import Controls
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.policy.pilotnet import PilotNet
@@ -61,7 +62,7 @@ class Scenery:
 
     def drive(
         self,
-        control: Callable[[np.ndarray], float],
+        control: Callable[[np.ndarray], Controls],
         horizon: int,
         expert_share: float = 0.0,
     ) -> Iterator[Labelled]:

@@ -9,9 +9,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from mi_nerfattack.deploy.environment import policy_image, told
+from mi_nerfattack.deploy.environment import policy_image, single_control, told
 from mi_nerfattack.deploy.place import Place
 from mi_nerfattack.deploy.sites import AbstractSite
+from mi_nerfattack.deploy.vehicle import Controls
 from mi_nerfattack.drives.spec import short_digest
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.run_folder import object_path
@@ -244,12 +245,12 @@ class SectionDrives(AbstractSource):
         memory, step = prepared.initial_memory(1), 0
         environment, route = scenery.environment, scenery.route
 
-        def control(image: np.ndarray) -> float:
+        def control(image: np.ndarray) -> Controls:
             nonlocal memory, step
             numbers = told(prepared, environment, route, step)
             seen, step = policy_image(image), step + 1
             row, memory = prepared.step(seen, route.goal, memory, numbers)
-            return float(np.array(row)[0])
+            return single_control(row, environment.control_names)
 
         yield from scenery.drive(control, self.horizon)
 
