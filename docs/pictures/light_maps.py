@@ -83,10 +83,11 @@ class Subject:
         """Render the field `relit`, linear (h, w, 3)."""
         volume = {"type": "grid_field", "filename": str(self.file), "relit": True}
         fields = {"type": "field_integrator", "relit_samples": 32, "object": volume}
-        sensor = mitsuba_sensor_dict(self.camera, self.pose, self.spp)
+        spp = self.spp // 4  # each with 32 light samples
+        sensor = mitsuba_sensor_dict(self.camera, self.pose, spp)
         parts = {"sensor": sensor, "integrator": fields}
         scene = mi.load_dict({"type": "scene", **emitters, **parts})
-        return np.array(mi.render(scene, spp=self.spp))[..., :3]
+        return np.array(mi.render(scene, spp=spp))[..., :3]
 
     def columns(self, name: str) -> Iterator[np.ndarray]:
         """Yield the pictures of each light below each other, and print their errors."""
