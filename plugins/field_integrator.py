@@ -35,7 +35,7 @@ from mi_nerfattack.render.backdrop import only_fields
 from mi_nerfattack.render.composite import Seen
 from mi_nerfattack.render.lighting import spectrum
 from mi_nerfattack.render.lighting.relight import LIGHT_SAMPLES, Relighting
-from mi_nerfattack.render.rays import Rays
+from mi_nerfattack.render.rays import Gain, Rays
 from mi_nerfattack.render.scene_march import nearest_surface
 
 
@@ -237,14 +237,14 @@ class FieldIntegrator(FilmIntegrator):
         active: Mask = True,
         δsplats: Any = None,
         width: int = 0,
-        gains: Sequence[mi.Color3f] = (),
+        gains: Sequence[Gain] = (),
         **kwargs: Any,
     ) -> tuple[Any, mi.Bool, list[mi.Float], Any]:
         """Integrate one ray a lane; see Mitsuba's ``RBIntegrator.sample``.
 
         A film gives cotangents of :meth:`splats` as ``δsplats``, and finds tangents in
         the place of the state. ``width``: rays in a row of an image, if nothing is
-        being recorded. ``gains``: factors of the fields' radiance, (3, n) each.
+        being recorded. ``gains``: light on each field.
         """
         del depth, kwargs
         is_primal = mode == dr.ADMode.Primal

@@ -13,7 +13,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.plugins.properties import background
 from mi_nerfattack.render.composite import Seen
 from mi_nerfattack.render.lighting import spectrum
-from mi_nerfattack.render.rays import March, Rays
+from mi_nerfattack.render.rays import Gain, March, Rays
 
 
 @dataclass
@@ -22,7 +22,7 @@ class State:
 
     Attributes:
         seen: the fields.
-        gains: factors of their radiance, as of `Rays`.
+        gains: light on them, as of `Rays`.
         behind: (channels, n), what the nested integrator sees; None without one.
         valid: (n,), whether it meets anything; likewise.
         aovs: its AOVs.
@@ -30,7 +30,7 @@ class State:
     """
 
     seen: Seen
-    gains: list[mi.Color3f] = field(default_factory=list)
+    gains: list[Gain] = field(default_factory=list)
     behind: Any = None
     valid: Any = None
     aovs: list[mi.Float] = field(default_factory=list)
@@ -90,8 +90,9 @@ def look(
     light = integrator.relighting
     if light is not None:
         found = light.gains(scene, sampler, integrator.posed, rays)
-        more = rays.gains or [mi.Color3f(1)] * len(found)
-        rays.gains = [a * b for a, b in zip(found, more, strict=True)]
+        more = rays.gains or [Gain()] * len(found)
+        pairs = zip(found, more, strict=True)
+        rays.gains = [Gain(colour * gain.colour, gain.row) for colour, gain in pairs]
     if width:
         dr.make_opaque(rays)
         seen = integrator.frozen.render(rays, width)

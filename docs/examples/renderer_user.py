@@ -5,7 +5,7 @@ from pathlib import Path
 import mitsuba as mi
 
 from mi_nerfattack import capture, fit, scenes
-from mi_nerfattack.capture.object_renders import Lighting
+from mi_nerfattack.render.lighting.lights import Lighting
 
 mi.set_variant("llvm_ad_rgb")
 

@@ -17,6 +17,7 @@ variant.ensure()  # before what imports mitsuba
 import diagrams  # noqa: E402
 import flat_objects  # noqa: E402
 import gallery_blocks  # noqa: E402
+import light_maps  # noqa: E402
 import plugin_scenes  # noqa: E402
 import run_pictures  # noqa: E402
 
@@ -27,6 +28,7 @@ PICTURES: dict[str, Callable[[Path, bool], None]] = {
     "flat": flat_objects.draw_flat,
     "gallery": gallery_blocks.gallery,
     "glass": plugin_scenes.glass,
+    "light_maps": light_maps.draw_light_maps,
     "plugins": plugin_scenes.plugins,
 }
 # Each of these shows a finished run, too.

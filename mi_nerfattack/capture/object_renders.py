@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -15,57 +14,15 @@ from mi_nerfattack.backend.colour import straight_rgba
 from mi_nerfattack.capture.mesh.mesh import TexturedMesh, mitsuba_shapes
 from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.ranges import Share, checked
 from mi_nerfattack.render.camera.intrinsics import Camera, from_fov, look_at
 from mi_nerfattack.render.camera.lens import generate_rays, pose_arrays
+from mi_nerfattack.render.lighting.lights import Lighting
 from mi_nerfattack.render.pathtrace.views import iterate_views
 
 _FOV_DEG = 40.0
 _MARGIN = 1.05
 _MAX_LAYERS = 64  # of transparent surfaces on one ray
 _SHARE_BELOW, _LOWEST = 0.15, -0.4
-
-
-@dataclass(frozen=True)
-@checked()
-class Lighting:
-    """White light of a constant part and a soft key light.
-
-    The radiance from direction w is `ambient + b max(0, w . key)^sharpness`, with b
-    such that an unoccluded surface facing the key has outgoing radiance equal to
-    its reflectance, and one facing away `ambient` times that. Nothing is brighter than
-    its reflectance, so that an 8-bit image clips nothing.
-
-    Args:
-        ambient: share of the constant part, in [0, 1].
-        sharpness: exponent of the key's lobe; 16 has half its brightness at 17 degrees.
-        key: direction towards the key light, any length.
-    """
-
-    ambient: Share = 0.75
-    sharpness: float = 16.0
-    key: tuple[float, float, float] = (0.5, -0.6, 1.0)
-
-    def emitter(self) -> dict[str, Any]:
-        """Describe the light as an `envmap` (64 x 128), z up."""
-        height, width = 64, 128
-        theta = (np.arange(height) + 0.5)[:, None] * np.pi / height
-        phi = np.arange(width) * 2 * np.pi / width
-        # Mitsuba's envmap: y up, column u is the direction (sin, ., -cos)(2 pi u)
-        x = np.sin(theta) * np.sin(phi)
-        z = -np.sin(theta) * np.cos(phi)
-        y = np.cos(theta) + 0 * phi
-        # turned by 90 degrees about x, its y becomes our z and its z our -y
-        key = np.array(self.key) / np.linalg.norm(self.key)
-        cosine = np.maximum(0, x * key[0] - z * key[1] + y * key[2])
-        gain = (1 - self.ambient) * (self.sharpness + 2) / 2
-        radiance = self.ambient + gain * cosine**self.sharpness
-        image = np.repeat(radiance[..., None], 3, axis=2).astype(np.float32)
-        return {
-            "type": "envmap",
-            "bitmap": mi.Bitmap(image),
-            "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90),
-        }
 
 
 def sphere_poses(

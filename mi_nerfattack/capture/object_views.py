@@ -18,12 +18,13 @@ from mi_nerfattack.capture.mesh.mesh import (
     turn_matrix,
 )
 from mi_nerfattack.capture.mesh.read import load_mesh, up_matrix
-from mi_nerfattack.capture.object_renders import Lighting, render_asset
+from mi_nerfattack.capture.object_renders import render_asset
 from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.capture.silhouettes import check_alpha, move_views, silhouette_bounds
 from mi_nerfattack.capture.transforms import read_images
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
+from mi_nerfattack.render.lighting.lights import Lighting
 
 
 @dataclass(frozen=True, eq=False)

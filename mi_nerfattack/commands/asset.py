@@ -78,6 +78,7 @@ class _Asset(ABC):
                 "source": self._source(),
                 "source_unit": views.images.unit,
                 "seed": str(self.seed),
+                **self._light(),
             }
             return finish(
                 result,
@@ -103,6 +104,10 @@ class _Asset(ABC):
     def _source(self) -> str:
         """Return the source's name, for the file's header."""
 
+    def _light(self) -> dict[str, str]:
+        """Return what is known about the light of the views, for the file's header."""
+        return {}
+
     @abstractmethod
     def _views(self, bars: StageBars) -> ObjectViews:
         """Render or read the views."""
@@ -119,10 +124,13 @@ class _Rendered(_Asset):
     ambient: float = 0.75
     """Share of light from everywhere; 1 bakes no shading into colours."""
 
+    def _light(self) -> dict[str, str]:
+        return {"ambient": repr(self.ambient)}
+
     def _views(self, bars: StageBars) -> ObjectViews:
-        from mi_nerfattack.capture.object_renders import Lighting
         from mi_nerfattack.capture.object_views import render_views
         from mi_nerfattack.errors import InputError
+        from mi_nerfattack.render.lighting.lights import Lighting
 
         view_px = 200 * self.resolution // 64 if self.view_px is None else self.view_px
         if view_px < _SSIM_PX:

@@ -13,6 +13,9 @@ from mi_nerfattack.backend.arrays import upload
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.occupancy import Occupancy, Window
 
+FLAT = "provenance.flat"
+"""Header entry of the field of a flat object: its kind."""
+
 
 class AbstractField(ABC):
     """Radiance field in its own frame: density and linear radiance at a point.

@@ -10,7 +10,6 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from mi_nerfattack.capture.mesh.cube_faces import (
-    FLAT,
     FLAT_FACES,
     CubeFaces,
     flat_share,
@@ -22,6 +21,7 @@ from mi_nerfattack.drives.store import read_drives
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.run_folder import DRIVES, object_path
 from mi_nerfattack.experiment.transfer.found import FoundAttack, read_found
+from mi_nerfattack.fields.base import FLAT
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.io import load_grid
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix

@@ -11,7 +11,7 @@ import drjit as dr
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.march import RayGradient
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.rays import March, Rays
+from mi_nerfattack.render.rays import Gain, March, Rays
 
 
 class AbstractBackdrop(ABC):
@@ -33,7 +33,7 @@ class AbstractBackdrop(ABC):
     def has_gradients(self) -> bool:
         """Whether derivatives by its parameters are asked for."""
 
-    def with_gain(self, gain: Any) -> AbstractBackdrop:
+    def with_gain(self, gain: Gain) -> AbstractBackdrop:
         """Return itself: the light of a backdrop stays as it was captured."""
         del gain
         return self

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -13,7 +14,25 @@ import numpy as np
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.render.camera.pose import Pose, offset_gradient
-from mi_nerfattack.render.rays import meet_box
+from mi_nerfattack.render.rays import Gain, meet_box
+
+
+class AbstractLightMaps(ABC):
+    """Factors of a field's radiance over its box, one map for each light."""
+
+    @abstractmethod
+    def factor(self, unit: mi.Point3f, row: mi.UInt32, active: mi.Bool) -> mi.Color3f:
+        """Interpolate a map, (3, n); differentiable by the place.
+
+        Args:
+            unit: (3, n), in the unit cube of the field's box; outside is clamped to it.
+            row: (n,), number of the map; 0 for the light of the capture.
+            active: (n,) mask.
+        """
+
+    @abstractmethod
+    def state(self) -> list[Any]:
+        """Return all that a kernel reads or was compiled for, for `drjit.freeze`."""
 
 
 class PosedField:
@@ -30,7 +49,9 @@ class PosedField:
         # so large that no ray comes there
         self._cone = mi.Float(max(field.cone, 1e-12))
         dr.make_opaque(self._cone)
-        self._gain: mi.Color3f | None = None
+        self._gain: Gain | None = None
+        #: Maps of other lights, which rays choose from by their gains.
+        self.light_maps: AbstractLightMaps | None = None
         #: What kernels read of the pose, in a list that is always up to date.
         self.live: list[Any] = []
         #: Field to world as Mitsuba has it; the same object for good.
@@ -135,14 +156,14 @@ class PosedField:
             self._cone,
         ]
 
-    def with_gain(self, gain: mi.Color3f) -> PosedField:
-        """Return this field with its radiance multiplied, ray by ray.
+    def with_gain(self, gain: Gain) -> PosedField:
+        """Return this field in another light, ray by ray.
 
         Args:
-            gain: (3, n) for the n rays of a march; a constant of its derivatives.
+            gain: of the n rays of a march.
         """
         twin = copy.copy(self)
-        twin._gain = dr.detach(gain)
+        twin._gain = Gain(dr.detach(gain.colour), gain.row)
         return twin
 
     @property
@@ -169,7 +190,9 @@ class PosedField:
         """Return all that a kernel reads or was compiled for, for `drjit.freeze`."""
         numbers = [self._columns, self._origin, self._inverse_scale]
         cells = self.field.occupancy.shape, self.field.window.is_open
-        return [self, cells, *numbers, self._step, self._cone, *self.field.arrays()]
+        maps = [] if self.light_maps is None else self.light_maps.state()
+        arrays = [self._step, self._cone, *self.field.arrays(), *maps]
+        return [self, cells, *numbers, *arrays]
 
     def to_local(
         self, origin: mi.Point3f, direction: mi.Vector3f
@@ -279,7 +302,10 @@ class PosedField:
         """Evaluate at a local point: density in 1/(world metre), and radiance."""
         density, radiance = self.field.eval(point, direction, active)
         if self._gain is not None:
-            radiance *= self._gain
+            radiance *= self._gain.colour
+            if self.light_maps is not None:
+                unit = self.field.unit(point)
+                radiance *= self.light_maps.factor(unit, self._gain.row, active)
         return self.in_world(density), radiance
 
 

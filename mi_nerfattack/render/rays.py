@@ -14,6 +14,19 @@ from mi_nerfattack.backend.arrays import concat, put
 
 
 @dataclass
+class Gain:
+    """Light on a field: what its radiance is multiplied by, ray by ray.
+
+    Attributes:
+        colour: (3, n), a constant of every derivative.
+        row: (n,), which of the field's light maps; 0 for the light of its capture.
+    """
+
+    colour: mi.Color3f = field(default_factory=lambda: mi.Color3f(1))
+    row: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
+
+
+@dataclass
 class Rays:
     """Rays in the world, and where a march places its samples on them.
 
@@ -23,8 +36,7 @@ class Rays:
         t_max: (n,), metres; where the ray ends.
         jitter: (n,) in [0, 1), position of the sample in its interval.
         active: (n,) mask.
-        gains: factors of the radiance of each field, (3, n) each; none for 1. They
-            are constants of every derivative.
+        gains: light on each field; none for the one of its capture.
     """
 
     origin: mi.Point3f = field(default_factory=lambda: mi.Point3f(0))
@@ -32,7 +44,7 @@ class Rays:
     t_max: mi.Float = field(default_factory=lambda: mi.Float(dr.inf))
     jitter: mi.Float = field(default_factory=lambda: mi.Float(0.5))
     active: mi.Bool = field(default_factory=lambda: mi.Bool(True))
-    gains: list[mi.Color3f] = field(default_factory=list)
+    gains: list[Gain] = field(default_factory=list)
 
     def light(self, posed: Sequence[Any]) -> list[Any]:
         """Return the fields with the rays' gains, one each unless there are none."""

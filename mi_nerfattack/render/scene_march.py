@@ -15,7 +15,7 @@ from mi_nerfattack.fields.cpu.ngp import PackedNGP
 from mi_nerfattack.fields.ngp import NGPField
 from mi_nerfattack.render.march import integrate, march
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.rays import March, Rays, pick_rays, put_rays
+from mi_nerfattack.render.rays import Gain, March, Rays, pick_rays, put_rays
 from mi_nerfattack.render.walk import Walk
 
 
@@ -166,7 +166,7 @@ class PackedMarch(AbstractSceneMarch):
         posed, looks = [self.posed], ([self._evaluate], [view])
         result = integrate(posed, walk, active, *looks, self.stop).march()
         for (gain,) in [rays.gains] if rays.gains else []:
-            result.radiance *= gain
+            result.radiance *= gain.colour
         return result
 
     def _evaluate(
@@ -205,7 +205,7 @@ def _opaque(rays: Rays) -> Rays:
         mi.Float(dr.detach(rays.t_max)),
         mi.Float(dr.detach(rays.jitter)),
         mi.Bool(rays.active),
-        [mi.Color3f(dr.detach(gain)) for gain in rays.gains],
+        [Gain(mi.Color3f(dr.detach(x.colour)), x.row) for x in rays.gains],
     )
     dr.make_opaque(rays)
     return rays

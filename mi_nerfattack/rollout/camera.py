@@ -16,6 +16,9 @@ from mi_nerfattack.render.camera.conventions import from_mitsuba, mitsuba_sensor
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
 from mi_nerfattack.render.camera.lens import mount_pose
 from mi_nerfattack.render.camera.rig import camera_seed
+from mi_nerfattack.render.lighting.shading import LightMaps
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import Gain
 from mi_nerfattack.rollout.variation import Variation
 
 
@@ -63,6 +66,7 @@ class SceneCamera:
     def _forget(self) -> None:
         self._mounts: dict[int, tuple[Any, Any]] = {}  # by the number of drives
         self._lights: dict[int, mi.Color3f] = {}
+        self._rows: dict[tuple[int, int], mi.UInt32] = {}  # of objects' light maps
 
     @property
     def size(self) -> tuple[int, int]:
@@ -187,16 +191,31 @@ class SceneCamera:
             )
         return found
 
-    def light(self, count: int) -> mi.Color3f | None:
-        """Return factors of the light on objects, (3, n), ray by ray; None for 1."""
-        if self.variation is None or not self.variation.of_light:
-            return None
+    def gain(self, item: PosedField, count: int) -> Gain:
+        """Return the light on an object, ray by ray, as the variation draws it.
+
+        Args:
+            item: with its `LightMaps`, where the variation draws suns.
+            count: of vehicles.
+        """
+        assert self.variation is not None  # else nobody asks
         if count not in self._lights:
             drawn = self.variation.draws(self.first, count).light
             light = mi.Color3f(*(mi.Float(channel.tolist()) for channel in drawn))
             dr.make_opaque(light)
             self._lights[count] = light
-        return dr.gather(mi.Color3f, self._lights[count], self._drives(count))
+        drive = self._drives(count)
+        colour = dr.gather(mi.Color3f, self._lights[count], drive)
+        if self.variation.sun is None:
+            return Gain(colour)
+        key = count, id(item)
+        if key not in self._rows:
+            suns = self.variation.suns(self.first, count)
+            assert isinstance(item.light_maps, LightMaps)
+            rows = mi.UInt32(item.light_maps.rows(suns, item.placed.rotation))
+            dr.make_opaque(rows)
+            self._rows[key] = rows
+        return Gain(colour, dr.gather(mi.UInt32, self._rows[key], drive))
 
     def eye(self, pose: Any, count: int) -> mi.Point3f:
         """Return where the eye of each ray of :meth:`rays` is, (3, n)."""

@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from mi_nerfattack.backend.arrays import differentiates_rays, vjp
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.render.rays import Gain
 from mi_nerfattack.rollout.camera import SceneCamera, pose_of
 from mi_nerfattack.rollout.parameters import CollectsRays
 from mi_nerfattack.rollout.sensor import Observation
@@ -43,7 +44,7 @@ class SceneImages:
             self.collector = integrator
 
     def observe(
-        self, camera: SceneCamera, state: Any, step: int, gains: Sequence[mi.Color3f]
+        self, camera: SceneCamera, state: Any, step: int, gains: Sequence[Gain]
     ) -> Observation:
         """Render the images of a batch.
 
@@ -51,7 +52,7 @@ class SceneImages:
             camera: sees.
             state: (m, n), as of :meth:`AbstractSensor.observe`.
             step: likewise.
-            gains: factors of the radiance of all layers, (3, rays) each; none for 1.
+            gains: the light on all layers; none for that of the capture.
         """
         count = dr.width(state)
         # From the state to rays, to their radiance, and to linear pixels
@@ -128,7 +129,7 @@ class SceneImages:
         sampler: mi.Sampler,
         view: Any,
         state_in: Any,
-        gains: Sequence[mi.Color3f] = (),
+        gains: Sequence[Gain] = (),
     ) -> tuple[mi.Color3f, Any]:
         """Return linear pixels, and the integrator's state."""
         ray, weight = view
@@ -148,7 +149,7 @@ class SceneImages:
         ray: mi.Ray3f,
         δL: Any = None,
         state_in: Any = None,
-        gains: Sequence[mi.Color3f] = (),
+        gains: Sequence[Gain] = (),
     ) -> tuple[Any, ...]:
         lit = {"gains": gains} if gains else {}
         return self.integrator.sample(

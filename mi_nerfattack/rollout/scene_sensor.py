@@ -15,7 +15,9 @@ from mi_nerfattack.render.backdrop import Layer
 from mi_nerfattack.render.camera.disturbance import side_by_side
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
 from mi_nerfattack.render.camera.rig import ONLY, Layout, Rig
+from mi_nerfattack.render.lighting.shading import light_maps
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import Gain
 from mi_nerfattack.rollout.camera import SceneCamera, sensor_of
 from mi_nerfattack.rollout.images import SceneImages
 from mi_nerfattack.rollout.parameters import Differentiated
@@ -86,7 +88,7 @@ class SceneSensor(AbstractDifferentiableSensor):
         self.names: tuple[str, ...] = (ONLY,)
         self._parameters = Differentiated(scene, self._images.collector)
         self.select(params)
-        self._lit: set[int] = set()  # layers whose light varies
+        self._lit: dict[int, PosedField] = {}  # by `id`, those whose light varies
         self._counter = [0]  # shared by copies
 
     def __repr__(self) -> str:
@@ -122,19 +124,22 @@ class SceneSensor(AbstractDifferentiableSensor):
         """Return this sensor with another light and mount in each drive of a batch.
 
         All cameras of a vehicle are raised and pitched alike. The light varies on the
-        :attr:`objects` that there are now.
+        :attr:`objects` that there are now. Where it has a sun, objects that have no
+        `LightMaps` get those of :func:`light_maps`.
 
         Raises:
             InputError: light on objects, and there are none.
         """
-        objects = {id(posed) for posed in self.objects}
+        objects = {id(posed): posed for posed in self.objects}
         if variation.of_light and not objects:
             raise InputError(
                 "light: there are no objects whose light could vary; show grid fields "
                 "by a field_integrator, and select their colours"
             )
+        for posed in objects.values() if variation.sun is not None else ():
+            posed.light_maps = posed.light_maps or light_maps(posed.field)
         result = self._drawing(variation=variation)
-        result._lit = objects
+        result._lit = objects if variation.of_light else {}
         return result
 
     def drawing_as(self, other: AbstractSensor) -> SceneSensor:
@@ -186,13 +191,13 @@ class SceneSensor(AbstractDifferentiableSensor):
         dr.eval(by_pose)
         return by_pose
 
-    def _gains(self, camera: SceneCamera, state: Any) -> list[mi.Color3f]:
-        """Return the variation's factors of all layers, (3, n) each; none for 1."""
-        light = camera.light(dr.width(state))
-        if light is None:
+    def _gains(self, camera: SceneCamera, state: Any) -> list[Gain]:
+        """Return the variation's light on all layers; none for that of the capture."""
+        if not self._lit:
             return []
-        plain = mi.Color3f(1)
-        return [light if id(x) in self._lit else plain for x in self.layers]
+        count, lit = dr.width(state), self._lit
+        found = {k: camera.gain(item, count) for k, item in lit.items()}
+        return [found.get(id(layer), Gain()) for layer in self.layers]
 
     # Cameras
 

@@ -9,9 +9,33 @@ import drjit as dr
 import numpy as np
 
 from mi_nerfattack.ranges import NonNegative, Whole, checked
+from mi_nerfattack.render.lighting.lights import Sunlight
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics, Dubins
 
-_STREAM = 4  # of the seed; disturbances and initial poses have others
+_STREAM, _SUNS, _LAGS = (
+    4,
+    8,
+    9,
+)  # of the seed; disturbances and initial poses have others
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class SunRanges:
+    """From where to where each number of a `Sunlight` is drawn, evenly."""
+
+    elevation_deg: Range = (10.0, 70.0)
+    azimuth_deg: Range = (0.0, 360.0)
+    share: Range = (0.0, 0.9)
+    colour_k: Range = (6500.0, 6500.0)
+
+    def draw(self, random: np.random.Generator, count: int) -> list[Sunlight]:
+        """Draw `count` suns; those before the last do not depend on the count."""
+        limits = [self.elevation_deg, self.azimuth_deg, self.share, self.colour_k]
+        low, high = np.transpose(limits)
+        numbers = random.uniform(low, high, (count, len(limits)))
+        return [Sunlight(*row) for row in numbers.tolist()]
 
 
 @dataclass(frozen=True)
@@ -31,6 +55,9 @@ class Variation:
         speed_sd: of the logarithm of the vehicle's speed.
         steering_sd: of the logarithm of its answer to the steering, as by a wrong
             wheelbase or by understeer.
+        steering_lag_s_sd: of the number whose size is the time constant of its
+            steering, seconds.
+        sun: sun and sky that light the objects; None for the light of their capture.
         seed: of all draws.
 
     Source: Athalye et al. 2018, expectation over transformation.
@@ -42,12 +69,15 @@ class Variation:
     height_sd: NonNegative = 0.0
     speed_sd: NonNegative = 0.0
     steering_sd: NonNegative = 0.0
+    steering_lag_s_sd: NonNegative = 0.0
+    sun: SunRanges | None = None
     seed: Whole = 0
 
     @property
     def of_light(self) -> bool:
         """Whether the light on objects differs."""
-        return bool(self.light_ev_sd or self.light_colour_ev_sd)
+        drawn = self.light_ev_sd or self.light_colour_ev_sd
+        return bool(drawn) or self.sun is not None
 
     @property
     def of_mount(self) -> bool:
@@ -57,12 +87,13 @@ class Variation:
     @property
     def of_vehicle(self) -> bool:
         """Whether the vehicle differs."""
-        return bool(self.speed_sd or self.steering_sd)
+        return bool(self.speed_sd or self.steering_sd or self.steering_lag_s_sd)
 
     def draws(self, first: int, count: int) -> Draws:
         """Draw for `count` drives, of which the first has the number `first`."""
         random = np.random.default_rng([self.seed, _STREAM])
         normal = random.normal(size=(first + count, 8))[first:].T
+        lags = np.random.default_rng([self.seed, _LAGS]).normal(size=first + count)
         light = self.light_ev_sd * normal[0] + self.light_colour_ev_sd * normal[1:4]
         return Draws(
             2.0**light,
@@ -70,7 +101,14 @@ class Variation:
             np.exp(self.height_sd * normal[5]),
             np.exp(self.speed_sd * normal[6]),
             np.exp(self.steering_sd * normal[7]),
+            self.steering_lag_s_sd * np.abs(lags[first:]),
         )
+
+    def suns(self, first: int, count: int) -> list[Sunlight]:
+        """Draw suns for the drives of :meth:`draws`."""
+        assert self.sun is not None  # else nobody asks
+        random = np.random.default_rng([self.seed, _SUNS])
+        return self.sun.draw(random, first + count)[first:]
 
 
 @dataclass(frozen=True)
@@ -83,6 +121,7 @@ class Draws:
         height: (n,), factors of the camera's height.
         speed: (n,), factors of the vehicle's speed.
         steering: (n,), factors of its heading rate.
+        lag_s: (n,), time constants of its steering, seconds.
     """
 
     light: np.ndarray
@@ -90,6 +129,7 @@ class Draws:
     height: np.ndarray
     speed: np.ndarray
     steering: np.ndarray
+    lag_s: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -101,14 +141,21 @@ class Varied(AbstractDynamics):
     the speed is one of them, the vehicle goes faster or slower than that row says, at
     each speed in the same proportion.
 
+    With a lag, the steering that acts is one row more, the last: it follows the command
+    by a first-order lag from 0. In a step of length h, the vehicle gets the control's
+    mean, and the row gets what an exact solution has at the end of a step by explicit
+    Euler. So a lag far below h does no harm, where the equation itself would be stiff.
+
     Args:
         model: the vehicle.
         variation: of it.
+        step_s: length h of an integration step, seconds.
         first: number of the first drive of a batch.
     """
 
     model: AbstractDynamics
     variation: Variation
+    step_s: float
     first: int = 0
     _uploaded: dict[Any, list[Any]] = field(
         default_factory=dict, init=False, repr=False, compare=False
@@ -121,7 +168,7 @@ class Varied(AbstractDynamics):
     @property
     def state_size(self) -> int:
         """See :class:`AbstractDynamics`."""
-        return self.model.state_size
+        return self.model.state_size + self._has_lag
 
     def numbered(self, first: int) -> Varied:
         """See :meth:`AbstractDynamics.numbered`."""
@@ -129,16 +176,26 @@ class Varied(AbstractDynamics):
 
     def extend(self, poses: np.ndarray) -> np.ndarray:
         """See :meth:`AbstractDynamics.extend`."""
-        return self.model.extend(poses)
+        states = self.model.extend(poses)
+        return np.pad(states, ((0, 0), (0, 1))) if self._has_lag else states
 
     def derivative(self, state: Any, control: Any) -> Any:
         """See :meth:`AbstractDynamics.derivative`."""
-        speed, steering = self.constants(state)
-        slope = self.model.derivative(state, control)
+        speed, steering, *lag = self.constants(state)
+        lagging = []
+        if lag:  # the control's mean over the step, and its slope
+            acting, (share, rate) = state[len(state) - 1], lag
+            several = self.control_size > 1
+            command, *more = list(control) if several else [control]
+            lagging = [rate * (command - acting)]
+            command = command + share * (acting - command)
+            control = type(control)(command, *more) if several else command
+        slope = self.model.derivative(self._without_lag(state), control)
         if not isinstance(self.model, Dubins):
             steering = steering * speed
         moved = speed * slope[0], speed * slope[1], steering * slope[2]
-        return type(state)(*moved, *(slope[i] for i in range(3, len(slope))))
+        others = [slope[i] for i in range(3, len(slope))]
+        return type(state)(*moved, *others, *lagging)
 
     def saturate(self, control: Any) -> Any:
         """See :meth:`AbstractDynamics.saturate`."""
@@ -146,14 +203,27 @@ class Varied(AbstractDynamics):
 
     def check(self, state: Any) -> None:
         """See :meth:`AbstractDynamics.check`."""
-        self.model.check(state)
+        self.model.check(self._without_lag(state))
+
+    @property
+    def _has_lag(self) -> bool:
+        return self.variation.steering_lag_s_sd > 0
+
+    def _without_lag(self, state: Any) -> Any:
+        """Return the state of the model."""
+        return type(state)(*list(state)[:-1]) if self._has_lag else state
 
     def constants(self, state: Any) -> list[Any]:
         """See :meth:`AbstractDynamics.constants`."""
         key = kind, count = dr.detached_t(type(state[0])), dr.width(state)
         if key not in self._uploaded:
             drawn = self.variation.draws(self.first, count)
-            found = [kind(drawn.speed.tolist()), kind(drawn.steering.tolist())]
+            numbers = [drawn.speed, drawn.steering]
+            if self._has_lag:
+                steps = self.step_s / np.maximum(drawn.lag_s, 1e-9)
+                kept = -np.expm1(-steps)
+                numbers += [kept / steps, kept / self.step_s]
+            found = [kind(values.tolist()) for values in numbers]
             dr.make_opaque(found)
             self._uploaded[key] = found
         return self._uploaded[key]

@@ -10,7 +10,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
 
 from mi_nerfattack.attack.objectives import (
     AbsoluteDeviation,
@@ -41,7 +42,7 @@ from mi_nerfattack.rollout.objective import (
     Worst,
 )
 from mi_nerfattack.rollout.scene_sensor import SceneSensor
-from mi_nerfattack.rollout.variation import Variation, Varied
+from mi_nerfattack.rollout.variation import SunRanges, Variation, Varied
 from mi_nerfattack.scenario.named_file import Code, File
 from mi_nerfattack.scenario.section import Kinds, Section, Trust
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics, to_state
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
 Weights = Annotated[
     Uniform | Linear | LastSeconds | Discounted | Listed | End, Kinds("uniform")
 ]
+Pair = tuple[Finite, Finite]
 Stops = Annotated[float, Field(ge=0, le=8)]  # powers of two
 Logarithm = Annotated[float, Field(ge=0, le=1)]  # of factors
 
@@ -253,9 +255,35 @@ class ObjectiveSection(Section):
         return WeightedSum(terms)
 
 
+def within(low: float, high: float) -> AfterValidator:
+    """Hold a range to limits, and its two ends to their order."""
+
+    def check(pair: Pair) -> Pair:
+        if not low <= pair[0] <= pair[1] <= high:
+            why = f"must be two numbers in order, from {low:g} to {high:g}"
+            raise PydanticCustomError("range", "{why}", {"why": why})
+        return pair
+
+    return AfterValidator(check)
+
+
+class SunSection(Section):
+    """Sun and sky on objects: the range of each number, of which draws are even."""
+
+    elevation_deg: Annotated[Pair, within(0, 90)] = (10.0, 70.0)
+    azimuth_deg: Annotated[Pair, within(-360, 720)] = (0.0, 360.0)  # from +y to +x
+    share: Annotated[Pair, within(0, 0.95)] = (0.0, 0.9)  # the sun's, of what faces it
+    colour_k: Annotated[Pair, within(1500, 20000)] = (6500.0, 6500.0)  # of the sun
+
+    def build(self) -> SunRanges:
+        """Make the ranges."""
+        return SunRanges(**self.model_dump())
+
+
 class VarySection(Section):
     """Standard deviations of normal draws, one of each for the drive of a pose."""
 
+    sun: SunSection | None = None  # None for that of the capture
     light_ev_sd: Stops = 0.0  # of the light on objects, powers of two
     light_colour_ev_sd: Stops = 0.0  # of each channel of it
     exposure_ev_sd: Stops = 0.0  # of the whole image, powers of two
@@ -266,6 +294,9 @@ class VarySection(Section):
     height_sd: Logarithm = 0.0  # of the logarithm of its height
     speed_sd: Logarithm = 0.0  # of the logarithm of the vehicle's speed
     steering_sd: Logarithm = 0.0  # of the logarithm of its heading rate
+    #: Of the number whose size is the time constant of the steering.
+    steering_lag_s_sd: NonNegative = 0.0
+    later: ClassVar[tuple[str, ...]] = ("sun", "steering_lag_s_sd")
 
     def applied(self, loop: ClosedLoop, seed: int) -> ClosedLoop:
         """Return a loop whose drives differ.
@@ -277,7 +308,8 @@ class VarySection(Section):
         Raises:
             InputError: there are no objects whose light could vary.
         """
-        drawn = self.model_dump()
+        drawn = {name: getattr(self, name) for name in type(self).model_fields}
+        drawn["sun"] = None if self.sun is None else self.sun.build()
         sizes = ("exposure_ev_sd", "blur_px_sd", "noise_sd", "colour_ev_sd")
         disturbance = Disturbance(
             **{name: drawn.pop(name) for name in sizes}, seed=seed
@@ -288,5 +320,5 @@ class VarySection(Section):
             assert isinstance(sensor, SceneSensor)  # as that of every world
             sensor = sensor.varied(variation)
         if variation.of_vehicle:
-            dynamics = Varied(dynamics, variation)
+            dynamics = Varied(dynamics, variation, loop.transition.dt)
         return replace(loop, sensor=sensor, dynamics=dynamics, disturbance=disturbance)

@@ -18,14 +18,14 @@ from mi_nerfattack.backend.arrays import (
     vjp,
 )
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.rays import Rays
+from mi_nerfattack.render.rays import Gain, Rays
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 
 def _rays(rng: np.random.Generator, count: int) -> Rays:
     origin = mi.Point3f(*[mi.Float(rng.random(count).tolist()) for _ in range(3)])
-    gains = [mi.Color3f(mi.Float(rng.random(count).tolist()))]
+    gains = [Gain(mi.Color3f(mi.Float(rng.random(count).tolist())))]
     rays = Rays(origin, mi.Vector3f(origin), gains=gains)
     rays.jitter, rays.t_max = dr.opaque(mi.Float, 0.5), dr.opaque(mi.Float, dr.inf)
     rays.active = dr.opaque(mi.Bool, True)
@@ -40,7 +40,7 @@ def test_dataclasses_are_laid_leaf_by_leaf_and_single_entries_spread(rng):
     found = concat(parts, counts)
     expected = np.concatenate([part.origin.numpy() for part in parts], axis=1)
     assert (found.origin.numpy() == expected).all()
-    assert found.gains[0].numpy().shape == (3, 13)
+    assert found.gains[0].colour.numpy().shape == (3, 13)
     assert found.jitter.numpy().tolist() == [0.5] * 6 + [0.25] * 7
     assert np.isinf(found.t_max.numpy()).sum() == 13
     assert found.active.numpy().tolist() == [True] * 13

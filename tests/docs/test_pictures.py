@@ -71,7 +71,12 @@ def assert_made(names: set[str], folder: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "pictures"),
-    [("plugins", PLUGINS), ("glass", {"glass.jpg"}), ("gallery", GALLERY)],
+    [
+        ("plugins", PLUGINS),
+        ("glass", {"glass.jpg"}),
+        ("light_maps", {"light_maps.jpg"}),
+        ("gallery", GALLERY),
+    ],
 )
 def test_pictures_are_made(name, pictures, tmp_path):
     make(name, tmp_path)

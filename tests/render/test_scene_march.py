@@ -18,7 +18,7 @@ from mi_nerfattack.render.camera.lens import generate_rays, mount_pose
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.march import STOP, march
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.rays import Rays
+from mi_nerfattack.render.rays import Gain, Rays
 from mi_nerfattack.render.scene_march import (
     FieldMarch,
     PackedMarch,
@@ -121,7 +121,7 @@ def test_gains_multiply_the_radiance(rng):
     posed, rays = PosedField(small_ngp()), random_rays(rng)
     gain = mi.Color3f(*(rng.uniform(0.5, 2, 300).tolist() for _ in range(3)))
     plain = PackedMarch(posed, STOP).march(rays)
-    rays.gains = [gain]
+    rays.gains = [Gain(gain)]
     for kind in (PackedMarch, FieldMarch):
         lit = kind(posed, STOP).march(rays)
         expected = np.array(plain.radiance) * np.array(gain)

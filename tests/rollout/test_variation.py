@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import drjit as dr
 import numpy as np
@@ -14,18 +14,21 @@ from mi_nerfattack.deploy.surrogate.environment import take_apart
 from mi_nerfattack.deploy.surrogate.scene import field_sensor
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import from_fov
+from mi_nerfattack.render.lighting.shading import LightMaps
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.splatting.background import SplatBackground
 from mi_nerfattack.rollout.loop import ClosedLoop, simulate
 from mi_nerfattack.rollout.scene_sensor import SceneSensor
-from mi_nerfattack.rollout.variation import Variation, Varied
+from mi_nerfattack.rollout.variation import SunRanges, Variation, Varied
 from mi_nerfattack.vehicle.bicycle import RateLimitedAckermann
 from mi_nerfattack.vehicle.dynamics import Ackermann, Dubins, to_control, to_state
 from mi_nerfattack.vehicle.single_track import KinematicSingleTrack
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-ALL = Variation(0.5, 0.4, 3.0, 0.2, 0.15, 0.25, seed=4)
+ALL = Variation(
+    0.5, 0.4, 3.0, 0.2, 0.15, 0.25, steering_lag_s_sd=0.2, sun=SunRanges(), seed=4
+)
 POSES = np.array([[0.0, 0.35, 0.02], [0.3, 0.2, -0.04], [-0.2, -0.1, 0.08]])
 
 
@@ -34,7 +37,7 @@ def varied(variation: Variation = ALL) -> tuple[ClosedLoop, SceneSensor]:
     loop, _ = toy.make_loop()
     plain = loop.sensor
     assert isinstance(plain, SceneSensor)
-    dynamics = Varied(loop.dynamics, variation)
+    dynamics = Varied(loop.dynamics, variation, loop.transition.dt)
     return replace(loop, sensor=plain.varied(variation), dynamics=dynamics), plain
 
 
@@ -51,9 +54,26 @@ def test_draws_have_the_given_deviations_and_belong_to_a_drive():
     assert (
         abs(np.corrcoef(np.vstack([factors, drawn.pitch_deg])) - np.eye(4)).max() < 0.03
     )
+    # the mean size of a normal number is sqrt(2 / pi)
+    assert drawn.lag_s.mean() == pytest.approx(0.2 * np.sqrt(2 / np.pi), rel=0.03)
     later = ALL.draws(2, 3)
     assert np.array_equal(later.light, drawn.light[:, 2:5])
     assert np.array_equal(later.speed, drawn.speed[2:5])
+    assert np.array_equal(later.lag_s, drawn.lag_s[2:5])
+
+
+def test_suns_are_spread_over_their_ranges_and_belong_to_a_drive():
+    ranges = SunRanges((10, 70), (-90, 90), (0.2, 0.8), (4000, 6500))
+    variation = Variation(sun=ranges, seed=4)
+    numbers = np.array([list(asdict(sun).values()) for sun in variation.suns(0, 4000)])
+    low, high = np.transpose(list(asdict(ranges).values()))
+    share = (numbers - low) / (high - low)
+    assert share.min() >= 0 and share.max() <= 1
+    assert share.mean(0) == pytest.approx(np.full(4, 0.5), abs=0.02)
+    assert share.std(0) == pytest.approx(np.full(4, 12**-0.5), rel=0.03)
+    assert abs(np.corrcoef(share.T) - np.eye(4)).max() < 0.06
+    assert variation.suns(2, 3) == variation.suns(0, 5)[2:]
+    assert variation.of_light and not variation.of_vehicle
 
 
 def test_light_multiplies_what_an_object_gives():
@@ -67,6 +87,28 @@ def test_light_multiplies_what_an_object_gives():
     expected = before.linear.numpy() + (gain - 1) * object_alone
     assert abs(expected - before.linear.numpy()).max() > 0.05
     np.testing.assert_allclose(after.linear.numpy(), expected, atol=2e-6)
+
+
+def test_each_drive_has_its_own_sun():
+    """What is seen of an object changes by factors that its drive's map has."""
+    variation = Variation(sun=SunRanges(), seed=1)
+    loop, plain = varied(variation)
+    state = loop.initial(POSES)
+    before, after = plain.observe(state, 0), loop.sensor.observe(state, 0)
+    shown = take_apart(plain, before, dr.zeros(type(before.linear.x), 1))
+    (posed,) = plain.objects
+    maps = posed.light_maps
+    assert isinstance(maps, LightMaps)
+    rows = maps.rows(variation.suns(0, 3), posed.placed.rotation)
+    assert len(set(rows)) == 3 and 0 not in rows
+    table = maps.table.numpy().reshape(-1, int(np.prod(maps.shape)), 4)[rows, :, :3]
+    alone = shown.objects[0].radiance.numpy().reshape(3, 3, -1)
+    change = (after.linear.numpy() - before.linear.numpy()).reshape(3, 3, -1)
+    for k in range(3):
+        low, high = table[k].min() - 1, table[k].max() - 1
+        assert (change[:, k] >= low * alone[:, k] - 1e-5).all()
+        assert (change[:, k] <= high * alone[:, k] + 1e-5).all()
+        assert abs(change[:, k]).max() > 0.02
 
 
 def test_each_drive_has_its_own_mount():
@@ -104,7 +146,7 @@ def test_each_drive_has_its_own_vehicle(model):
     variation = Variation(speed_sd=0.2, steering_sd=0.3, seed=3)
     drawn = variation.draws(0, 3)
     rows = model.state_size
-    vehicle = Varied(model, variation)
+    vehicle = Varied(model, variation, 0.1)
     loop, _ = toy.make_loop()
     start = replace(loop, dynamics=model).initial(POSES)
     control = type(start[0])([0.3, -0.2, 0.1])
@@ -121,7 +163,8 @@ def test_each_drive_has_its_own_vehicle(model):
 
 def test_a_vehicle_with_a_speed_state_is_faster_at_each_speed():
     model = KinematicSingleTrack(8.0)
-    vehicle = Varied(model, Variation(speed_sd=0.2, steering_sd=0.3, seed=3))
+    variation = Variation(speed_sd=0.2, steering_sd=0.3, seed=3)
+    vehicle = Varied(model, variation, 0.1)
     assert vehicle.control_names == model.control_names
     state = to_state(np.repeat(model.extend(np.zeros(3)), 3, 0))
     control = to_control(np.array([[0.1, 1.0]] * 3))
@@ -133,6 +176,34 @@ def test_a_vehicle_with_a_speed_state_is_faster_at_each_speed():
     np.testing.assert_allclose(slope[3], 1.0)
 
 
+def test_steering_follows_its_command_by_a_lag():
+    """As the solution of the lag has it, for steps far above the time constant, too."""
+    variation = Variation(steering_lag_s_sd=0.2, seed=3)
+    lag, step, command = variation.draws(0, 3).lag_s, 0.1, 0.3
+    vehicle = Varied(Dubins(5, 1.5), variation, step)
+    assert vehicle.state_size == 4
+    start = to_state(vehicle.extend(POSES))
+    state, control = start, type(start[0])([command] * 3)
+    for _ in range(8):
+        state = toy.EULER.step(vehicle, state, control, step)
+    end = 8 * step
+    acting = command * (1 - np.exp(-end / lag))
+    turned = command * (end - lag * (1 - np.exp(-end / lag)))
+    np.testing.assert_allclose(np.array(state)[3], acting, rtol=1e-9)
+    np.testing.assert_allclose(np.array(state)[2] - POSES[:, 2], turned, rtol=1e-9)
+    assert lag.min() < 0.1 < lag.max()
+
+
+def test_a_lag_of_the_steering_leaves_the_pedals_alone():
+    model = KinematicSingleTrack(8.0)
+    vehicle = Varied(model, Variation(steering_lag_s_sd=0.2, seed=3), 0.1)
+    state = to_state(np.repeat(vehicle.extend(np.zeros(3)), 3, 0))
+    control = to_control(np.array([[0.1, 1.0]] * 3))
+    after = np.array(toy.EULER.step(vehicle, state, control, 0.1))
+    np.testing.assert_allclose(after[3], 8.1)
+    assert (after[4] > 0).all() and (after[4] < 0.1).all()
+
+
 def test_a_varied_drive_is_the_same_in_any_batch_and_from_run_to_run():
     loop, plain = varied()
     batch = simulate(loop, loop.initial(POSES), 8).states_numpy()
@@ -141,8 +212,8 @@ def test_a_varied_drive_is_the_same_in_any_batch_and_from_run_to_run():
         alone = simulate(loop.numbered(k), loop.initial(pose), 8).states_numpy()
         np.testing.assert_allclose(alone[0], batch[k], atol=1e-5)
     nominal = replace(loop, sensor=plain, dynamics=loop.dynamics.model)
-    other = simulate(nominal, loop.initial(POSES), 8).states_numpy()
-    assert abs(other - batch).max() > 0.05
+    other = simulate(nominal, nominal.initial(POSES), 8).states_numpy()
+    assert abs(other - batch[..., :3]).max() > 0.05
 
 
 @pytest.mark.parametrize("adjoint", toy.ADJOINTS)

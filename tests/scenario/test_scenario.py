@@ -13,6 +13,7 @@ from mi_nerfattack.io import files
 from mi_nerfattack.io.resumable import differences
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.rollout.variation import SunRanges
 from mi_nerfattack.scenario.named_file import NamedFile, portable_text
 from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.scenario.world import initial_states
@@ -108,6 +109,23 @@ def test_values_and_names_of_functions_count(load, tmp_path):
     text = HEAD.replace(POLICY, CODE)
     texts = HEAD, f"{HEAD}[drive]\nhorizon = 4\n", text, text.replace(":f", ":g")
     assert len({load(each)[0].digest() for each in texts}) == 4
+
+
+def test_keys_that_came_later_count_where_they_are_set(load, tmp_path):
+    write_named_files(tmp_path)
+    light = HEAD + "[attack.vary.sun]\nelevation_deg = [15, 60]\n"
+    lag = HEAD + "[attack.vary]\nsteering_lag_s_sd = 0.1\n"
+    texts = HEAD, light, light.replace("60", "50"), lag
+    assert len({load(each)[0].digest() for each in texts}) == 4
+    key = "scenario.attack.vary"
+    assert not {f"{key}.sun", f"{key}.steering_lag_s_sd"} & set(
+        load(HEAD)[0].identity()
+    )
+    scenario, _ = load(light)
+    assert scenario.identity()[f"{key}.sun.elevation_deg"] == "[15.0, 60.0]"
+    sun = scenario.attack.vary.sun
+    assert sun is not None
+    assert sun.build() == SunRanges(elevation_deg=(15.0, 60.0))
 
 
 def test_a_billboard_counts_with_its_picture(load, tmp_path):

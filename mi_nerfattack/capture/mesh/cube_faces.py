@@ -13,6 +13,7 @@ import numpy as np
 from mi_nerfattack.backend.colour import straight_rgba
 from mi_nerfattack.capture.mesh.mesh import CUBE_FACES, MeshPart, TexturedMesh
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.base import FLAT
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.io import files
 from mi_nerfattack.render.march import march
@@ -26,8 +27,6 @@ _RIM_PX = 3
 _FLAT_VOXELS = 5  # how far a fitted surface lies from the object's
 OBJECT_BOX = ("provenance.object_lower", "provenance.object_upper")
 """Header entries of the box of the object that a field was fitted to."""
-FLAT = "provenance.flat"
-"""Header entry of the field of a flat object: its kind."""
 FLAT_FACES = {"billboard": "ny", "patch": "pz"}
 """Which face of the box shows the picture, as `CUBE_FACES` names it, by kind."""
 

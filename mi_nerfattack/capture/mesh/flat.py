@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
-from mi_nerfattack.capture.mesh.cube_faces import FLAT, FLAT_FACES
+from mi_nerfattack.capture.mesh.cube_faces import FLAT_FACES
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.base import FLAT
 from mi_nerfattack.fields.grid import GridField, GridLayout
 from mi_nerfattack.fields.occupancy import Occupancy
 

@@ -18,7 +18,7 @@ from mi_nerfattack.system.machine import peak_memory_mb
 _PERIODS = 6  # of the iterations that are timed
 _KEPT_BYTES = 20  # of a sample, layer, period and pose
 _BEHIND_BYTES = 13  # of a sample of the nested integrator: colour, and whether it hits
-_LIGHT_BYTES = 12  # of light that varies
+_LIGHT_BYTES = 16  # of light that varies
 _PICTURES_MB = 10.0
 
 
@@ -160,7 +160,7 @@ def _kept_mb(world: World) -> float:
         kept += _KEPT_BYTES
     if sensor.integrator.behind is not None:
         kept += _BEHIND_BYTES
-    if section.vary.light_ev_sd or section.vary.light_colour_ev_sd:
+    if section.vary.light_ev_sd or section.vary.light_colour_ev_sd or section.vary.sun:
         kept += _LIGHT_BYTES
     samples = section.poses * sum(camera.per_image for camera in sensor.cameras)
     return kept * samples * max(0, world.horizon - _PERIODS) / 1e6

@@ -37,6 +37,7 @@ vary.pitch_deg_sd = 1.0
 vary.height_sd = 0.1
 vary.speed_sd = 0.1
 vary.steering_sd = 0.1
+vary.steering_lag_s_sd = 0.1
 """
 
 
