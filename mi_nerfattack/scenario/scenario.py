@@ -271,8 +271,7 @@ class Scenario(Section):
             refuse("cameras", "stands beside [camera]; give one of them")
         if self.scene.surrogate is not None:
             refuse("cameras", f"{self.scene.surrogate} has one sensor; give [camera]")
-        names = [camera.name for camera in self.cameras]
-        if len(set(names)) != len(names):
+        if len(set(names := [item.name for item in self.cameras])) != len(names):
             refuse("cameras", f"names {names}; must differ")
 
     def _check_placed(self) -> None:

@@ -13,7 +13,9 @@ from support.reference import loop as analytic
 from support.reference.derivatives import central_difference, nothing_compiled
 from support.worlds.loops import ADJOINTS, Wave, assert_close, flat
 
-from mi_nerfattack.policy.action import Action
+from mi_nerfattack.policy.action import Action, Trajectory
+from mi_nerfattack.policy.base import Numbers
+from mi_nerfattack.policy.inputs import Inputs
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import ClosedLoop
@@ -87,6 +89,36 @@ def test_attached_gradient_is_that_of_the_whole_loop(vehicle, delay, memory, rng
         loop.sensor.set_textures([base + s * direction])
         return rollout.run(to_state(start + s * along)).value
 
+    assert central_difference(value, 1e-4) == pytest.approx(expected, rel=1e-5)
+
+
+class Positions(TwoControls):
+    """Two positions ahead, which grow with the speed that it is told."""
+
+    def forward(self, image, speed, goal):
+        steering, acceleration = super().forward(image, goal).T
+        ahead = speed[:, 0] * torch.tensor([[0.4], [0.8]]) + 0.2 * acceleration
+        left = torch.stack([0.1 * steering, 0.5 * steering])
+        return torch.stack([ahead, left], 2).transpose(0, 1)
+
+
+def test_a_path_is_followed_by_steering_and_acceleration(rng):
+    """The speed that the policy is told, and the follower uses, is the state's row."""
+    follow = Trajectory((0.4, 0.8), ("steering", "acceleration"), 2.5, 1.0, 0.2)
+    inputs = Inputs(("image", "speed", "goal"), Numbers(speed=True))
+    policy = TorchPolicy(Positions(), action=Action(trajectory=follow), inputs=inputs)
+    loop = replace(make_loop(delay=1), policy=policy)
+    start = loop.dynamics.extend(analytic.random_poses(2))
+    rollout = Rollout(loop, Wave(), 6, attached=True)
+    evaluation = rollout.run(to_state(start))
+    assert evaluation.trajectory.controls_numpy().shape == (2, 6, 2)
+    found = np.array(rollout.gradient(evaluation).initial).T
+    along = rng.normal(size=start.shape)
+
+    def value(s):
+        return rollout.run(to_state(start + s * along)).value
+
+    expected = (found * along).sum()
     assert central_difference(value, 1e-4) == pytest.approx(expected, rel=1e-5)
 
 
