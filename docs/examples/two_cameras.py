@@ -17,14 +17,14 @@ EPOCHS = 12
 
 
 class Net(nn.Module):
-    """Two images (n, 3, 66, 100) and the speed (n, 1) in, positions (n, 4, 2) out."""
+    """Images of 200x66 and 100x66 and the speed (n, 1) in, positions (n, 4, 2) out."""
 
     def __init__(self):
         super().__init__()
         layers = [nn.Conv2d(3, 24, 5, 2), nn.ELU(), nn.Conv2d(24, 36, 5, 2), nn.ELU()]
         layers += [nn.Conv2d(36, 48, 3, 2), nn.ELU(), nn.Conv2d(48, 48, 3), nn.ELU()]
         self.eye = nn.Sequential(*layers, nn.Flatten())
-        self.head = nn.Sequential(nn.Linear(2 * 48 * 4 * 8 + 1, 64), nn.ELU())
+        self.head = nn.Sequential(nn.Linear(48 * 4 * (21 + 8) + 1, 64), nn.ELU())
         self.path = nn.Linear(64, 8)
         self.seconds = (0.5, 1.0, 1.5, 2.0)
 
@@ -44,7 +44,7 @@ def train(network, data):
     for epoch in range(EPOCHS):
         total = 0.0
         for batch in DataLoader(frames, 32, shuffle=True, drop_last=True):
-            front, wide = batch.image.split(100, dim=3)
+            front, wide = batch.image.split([200, 100], dim=3)
             path = network(front, wide, batch.speed[:, None])
             error = (path - batch.waypoints).norm(dim=2).mean()
             adam.zero_grad()

@@ -28,19 +28,30 @@ from mi_nerfattack.scenario.scenario import load_scenario
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-GUIDE = Path(__file__).parents[2] / "docs" / "policy.md"
+DOCS = Path(__file__).parents[2] / "docs"
+GUIDE = DOCS / "policy.md"
 SCENARIO = HEAD.partition("[policy]")[0]
 
 
-def chapters():
-    """Yield the guide's examples: title, Python blocks, scenario text."""
-    text = GUIDE.read_text("utf-8")
+def chapters(page=GUIDE):
+    """Yield the examples of a page: title, Python blocks, scenario text."""
+    text = page.read_text("utf-8")
     for chapter in re.split(r"(?m)^##+ ", text)[1:]:
         blocks = re.findall(r"(?s)```(\w+)\n(.*?)```", chapter)
         toml = [body for kind, body in blocks if kind == "toml"]
-        if toml and "openpilot" not in toml[0]:  # test_openpilot.py writes its files
+        title = chapter.partition("\n")[0]
+        if toml and title != "openpilot":  # it is run with the files that it needs
             python = [body for kind, body in blocks if kind == "python"]
-            yield pytest.param(python, toml[0], id=chapter.partition("\n")[0])
+            yield pytest.param(python, toml[0], id=title)
+
+
+EXAMPLES = [*chapters(), *chapters(DOCS / "your_policy.md")]
+
+
+def server_of_the_guide():
+    """Return the code of the guide's server."""
+    (blocks,) = (p.values[0] for p in chapters() if p.id == "A policy behind a URL")
+    return next(block for block in blocks if block.startswith("# server.py"))
 
 
 def run_blocks(blocks, folder, monkeypatch):
@@ -57,29 +68,39 @@ def run_blocks(blocks, folder, monkeypatch):
             exec(compile(block, "guide", "exec"), {"__name__": "guide"})
 
 
-@pytest.mark.parametrize(("blocks", "toml"), list(chapters()))
+@pytest.mark.parametrize(("blocks", "toml"), EXAMPLES)
 def test_examples_of_the_guide(blocks, toml, tmp_path, monkeypatch, served, rng):
     if any("import onnx" in block for block in blocks):
         pytest.importorskip("onnx", reason="the extra onnx is not installed")
     before = set(sys.modules)
     run_blocks(blocks, tmp_path, monkeypatch)
-    if (tmp_path / "server.py").exists():
+    if "url = " in toml:
         scope = {"__name__": "server"}
-        exec((tmp_path / "server.py").read_text(), scope)
+        exec(server_of_the_guide(), scope)
         toml = toml.replace("http://127.0.0.1:8000", served(scope["Handler"]))
     write_named_files(tmp_path)
     path = tmp_path / "scenario.toml"
     path.write_text(SCENARIO + toml)
     scenario, _ = load_scenario(path)
     assert scenario.digest() == load_scenario(path)[0].digest()
-    policy = scenario.policy.build()
-    image, memory = camera(2, rng), policy.initial_memory(2)
+    rig, count = scenario.rig(), scenario.vehicle.build().control_size
+    policy = scenario.policy.build(rig.views)
+    image = mi.TensorXf(rng.random((2, *rig.size[::-1], 3), dtype=np.float32))
+    memory, numbers = policy.initial_memory(2), None
+    if size := policy.numbers.size:
+        numbers = mi.TensorXf(rng.uniform(4, 6, (2, size)))
     for _ in range(2):
-        control, after = policy.step(image, 1, memory)
-        assert control.numpy().shape == (2,) and np.isfinite(control.numpy()).all()
+        control, after = policy.step(image, 1, memory, numbers)
+        assert control.numpy().shape == ((2,) if count == 1 else (count, 2))
+        assert np.isfinite(control.numpy()).all()
         if policy.differentiable:
-            d_image, d_memory, _ = policy.step_vjp(image, 1, memory, mi.Float(1, 1), ())
-            assert d_image.shape == image.shape and np.any(d_image.numpy())
+            weight = 0 * control + 1
+            d_image, d_memory, _ = policy.step_vjp(
+                image, 1, memory, weight, (), numbers
+            )
+            assert d_image.shape == image.shape
+            for part in rig.split(d_image.numpy()).values():
+                assert np.any(part)  # each camera counts
             assert len(d_memory) == len(memory)
         memory = after
     for name in set(sys.modules) - before:
