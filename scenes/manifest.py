@@ -29,7 +29,7 @@ BUDGET_MB = {
     "hydrant/field.safetensors": 2.5,
     "cube/field.safetensors": 4,
     "other data": 3.3,
-    "code": 3.2,
+    "code": 3.5,
 }
 _KEYS = {"command", "seed", "sha256", "bytes", "machine", "note"}
 

@@ -69,6 +69,40 @@ def _watch(
 
 
 @contextmanager
+def noticed_interrupts() -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM arrive, and raise at the end what the code has caught.
+
+    For code of others, which may save its state and return.
+
+    Raises:
+        KeyboardInterrupt: one came, whatever the code made of it.
+    """
+    came: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before: dict[int, Callable[[int, FrameType | None], object]] = {}
+    for number in SIGNALS:
+        handler = signal.getsignal(number)
+        if callable(handler):
+            before[number] = handler
+
+    def notice(number: int, frame: FrameType | None) -> None:
+        came.append(number)
+        before[number](number, frame)
+
+    for number in before:
+        signal.signal(number, notice)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if came:
+        raise KeyboardInterrupt
+
+
+@contextmanager
 def held_interrupts(*, all_of_them: bool = False) -> Iterator[Callable[[], None]]:
     """Hold Ctrl-C and SIGTERM back; what is yielded raises them.
 

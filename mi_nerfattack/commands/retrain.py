@@ -54,7 +54,7 @@ class Retrain:
     ]
     """Folders of finished runs of attack, on one policy, in one place."""
     output: Path
-    """Policy file to write, of the kind of the old one."""
+    """Policy file to write: of the suffix of the old one, or .toml."""
     data: Path
     """Folder of new frames and checkpoints; made if missing."""
     command: str | None = None
@@ -126,7 +126,11 @@ class Retrain:
         groups, others = self._groups(attacks)
         settings = self._settings(policy.attacked, place)
         sites = self._sites(place, settings, attacks[0].scenario.vehicle)
-        workers = chosen_workers(self.workers, False)
+        # a server that keeps a state would mix the drives of several processes
+        from mi_nerfattack.scenario.policy.kinds import HttpSection
+
+        alone = isinstance(policy.attacked, HttpSection)
+        workers = chosen_workers(self.workers, alone)
         frames = FramesAmong(sites, groups[OLD], settings, self.data, workers)
         names = self.environments
         drives = Comparison(groups, names, self.runs, self.spp, self.data)

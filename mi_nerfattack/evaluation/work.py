@@ -41,6 +41,7 @@ from mi_nerfattack.scenario.named_file import section_content
 from mi_nerfattack.scenario.policy.base import AbstractPolicySection
 from mi_nerfattack.scenario.vehicle import AbstractVehicleSection
 from mi_nerfattack.system.workers import AbstractWorkers, InThisProcess
+from mi_nerfattack.vehicle.dynamics import control_size, require_controls
 from mi_nerfattack.vehicle.expert import expert_for
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -307,7 +308,8 @@ def check_policy(policy: AbstractPolicy, place: Place, routes: Sequence[Route]) 
     """Show a policy a black image for every goal.
 
     Raises:
-        InputError: the camera's image or a goal does not fit.
+        InputError: the camera's image or a goal does not fit, or the place's car takes
+            another number of controls.
     """
     width, height = place.rig.size
     shape = (1, height, width, 3)
@@ -315,7 +317,9 @@ def check_policy(policy: AbstractPolicy, place: Place, routes: Sequence[Route]) 
     if size := policy.numbers.size:
         numbers = mi.TensorXf(np.zeros((1, size), np.float32))
     for route in routes:
-        policy.step(image, route.goal, policy.initial_memory(1), numbers)
+        memory = policy.initial_memory(1)
+        control, _ = policy.step(image, route.goal, memory, numbers)
+        require_controls(control_size(control), place.car.control_names)
 
 
 def _relative(name: str) -> str:

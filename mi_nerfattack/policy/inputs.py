@@ -55,9 +55,20 @@ class Inputs:
         return tuple(name for name in self.names or cameras if name in cameras)
 
     def pictures(self, frame: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Take a frame (n, height, width, 3) apart into the images of the network."""
+        """Take a frame (n, height, width, 3) apart into the images of the network.
+
+        Raises:
+            InputError: the frame is not as large as the images side by side.
+        """
         if not self.views:
             return {IMAGE: frame}
+        high = max(rows.stop for rows, _ in self.views.values())
+        wide = max(columns.stop for _, columns in self.views.values())
+        if tuple(frame.shape[1:3]) != (high, wide):
+            raise InputError(
+                f"frame: {frame.shape[2]} x {frame.shape[1]} px; the images of "
+                f"{', '.join(self.views)} side by side have {wide} x {high} px"
+            )
         every = slice(None)
         return {name: frame[(every, *self.views[name])] for name in self.images}
 

@@ -54,7 +54,7 @@ class Counting(AbstractPolicy):
         assert count == 1
         return (0,)
 
-    def step(self, image, goal, memory):
+    def step(self, image, goal, memory, numbers=None):
         self.seen.append((image.numpy().copy(), goal, memory[0]))
         return dr.opaque(mi.Float, self.value, 1), (memory[0] + 1,)
 

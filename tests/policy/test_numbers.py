@@ -93,6 +93,13 @@ def test_stacks_of_frames_are_kept_camera_by_camera(rng):
     assert float(control[0]) == pytest.approx(wanted, rel=1e-5)
 
 
+def test_a_frame_of_other_cameras_is_refused(rng):
+    frame = mi.TensorXf(rng.uniform(0, 1, (1, 4, 9, 3)).astype(np.float32))
+    numbers = mi.TensorXf(np.ones((1, TOLD.size), np.float32))
+    with pytest.raises(InputError, match="9 x 4 px; .* have 10 x 4 px"):
+        wide().step(frame, 0, (), numbers)
+
+
 def test_functions_get_what_they_name(rng):
     seen = {}
 

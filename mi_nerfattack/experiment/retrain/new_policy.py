@@ -43,8 +43,9 @@ class Successor:
     def _named(self) -> tuple[str, NamedFile] | None:
         """Key and file of the weights, or else of the code; None of a server."""
         leaves = self.attacked.leaves()
-        named = [(str(k), v) for (k, *_), v in leaves if isinstance(v, NamedFile)]
-        return named[-1] if named else None  # weights_file comes after file
+        named = {str(k): v for (k, *_), v in leaves if isinstance(v, NamedFile)}
+        key = "weights_file" if "weights_file" in named else "file"
+        return (key, named[key]) if key in named else None
 
     @property
     def weights(self) -> tuple[str, NamedFile] | None:

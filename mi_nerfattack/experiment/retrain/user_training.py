@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+from mi_nerfattack.backend.interrupts import noticed_interrupts
 from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.experiment.retrain.shown_process import ending, run_shown
 from mi_nerfattack.io import files
@@ -205,9 +206,15 @@ class ModuleTraining(AbstractUserTraining):
         return _checksums({file.name: file} | helper_files(file))
 
     def run(self, order: TrainingOrder, lock: int | None) -> None:
-        """Call the function."""
+        """Call the function; what it makes of an interrupt does not count."""
         try:
-            load_function(*self._parts)(order.data, order.out, order.seed)
+            with noticed_interrupts():
+                load_function(*self._parts)(order.data, order.out, order.seed)
+        except SystemExit as err:
+            raise InputError(
+                f"{self.option}: {self.name}: ends the program ({err.code}); let it "
+                "return when it has written its file, or raise an exception"
+            ) from err
         except Exception as err:
             if is_interrupt(err) or isinstance(err, InputError):
                 raise
@@ -236,10 +243,12 @@ def chosen_training(
 
 def _checksums(named: Mapping[str, Path]) -> dict[str, str]:
     """Return checksums by name; absolute paths tell about the machine alone."""
-    return {
-        Path(name).name if os.path.isabs(name) else name: files.sha256(path)
-        for name, path in named.items()
-    }
+    found: dict[str, str] = {}
+    for name, path in named.items():
+        short = Path(name).name if os.path.isabs(name) else name
+        key = short if short not in found else f"{short} {len(found)}"
+        found[key] = files.sha256(path)
+    return found
 
 
 def train_once(

@@ -183,9 +183,11 @@ class RunScene:
 
         Args:
             text: to write.
-            apart: (height, width, 3), uint8, as large as what the camera sees; None
-                for none.
+            apart: (height, width, 3), uint8, as large as what the cameras see; None
+                for none. The first camera's part is shown.
         """
+        layout = self._viewed.world.place.rig.layout
+        apart = None if apart is None else layout.split(apart)[0]
         if self._text is None:
             self._text = self._scene.add_label(
                 "/camera/text",

@@ -281,17 +281,20 @@ PolicySection = Annotated[
 ]
 
 
-def load_policy(keys: Mapping[str, Any], folder: str | Path = ".") -> AbstractPolicy:
+def load_policy(
+    keys: Mapping[str, Any], folder: str | Path = ".", views: Views = NO_VIEWS
+) -> AbstractPolicy:
     """Make a policy.
 
     Args:
         keys: of a section ``[policy]``.
         folder: that its paths start from.
+        views: as of `AbstractPolicySection.build`; those of a `Rig`.
 
     Raises:
         InputError: a key or a file cannot be used, see `AbstractPolicySection.build`.
     """
-    return read_section("policy", PolicySection, dict(keys), folder).build()
+    return read_section("policy", PolicySection, dict(keys), folder).build(views)
 
 
 def build_differentiable(

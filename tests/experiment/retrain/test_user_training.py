@@ -125,6 +125,37 @@ def test_a_module_is_called_here(tmp_path):
     assert about["module"] == training.name and list(about["code"]) == ["mine.py"]
 
 
+def test_a_module_that_catches_an_interrupt_has_not_trained(tmp_path):
+    (tmp_path / "mine.py").write_text(
+        "import os, signal, sys\n"
+        "def saves(data, out, seed):\n"
+        "    try:\n"
+        "        os.kill(os.getpid(), signal.SIGINT)\n"
+        "        for _ in range(10**6): pass\n"
+        "    except KeyboardInterrupt:\n"
+        "        out.write_text('half')\n"
+        "def ends(data, out, seed): sys.exit(0)\n"
+    )
+    order, file = order_in(tmp_path), tmp_path / "mine.py"
+    with pytest.raises(KeyboardInterrupt):
+        train(ModuleTraining(f"{file}:saves", trusted=True), order)
+    assert not order.out.with_name("done.json").exists()
+    with pytest.raises(InputError, match="ends the program"):
+        train(ModuleTraining(f"{file}:ends", trusted=True), order)
+
+
+def test_files_of_one_name_both_count(tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "c.toml").write_text(name)
+    words = f"{tmp_path}/a/c.toml {tmp_path}/b/c.toml {{data}} {{out}}"
+    training = command(tmp_path, WRITES, words)
+    before = training.code()
+    (tmp_path / "a" / "c.toml").write_text("other")
+    assert training.code() != before
+    assert len(before) == 4  # Python, the script, and both
+
+
 FAILS = "import sys\nfor k in range(40): print('line', k)\nsys.exit(7)"
 
 
