@@ -57,10 +57,9 @@ class ServePolicy:
             import mitsuba as mi
 
             black = mi.TensorXf(np.zeros((1, *self.size[::-1], 3), np.float32))
-            numbers = None
-            if size := policy.numbers.size:
-                numbers = mi.TensorXf(np.zeros((1, size), np.float32))
-            policy.step(black, 0, policy.initial_memory(1), numbers)
+            from mi_nerfattack.deploy.environment import trial_numbers
+
+            policy.step(black, 0, policy.initial_memory(1), trial_numbers(policy))
         with closing(PolicyServer(endpoint, policy, token)) as server:
             asked = "asks for the token" if token else "on this computer alone"
             say(f"Serving at http://{endpoint}, {asked}; Ctrl-C ends")

@@ -13,7 +13,7 @@ import numpy as np
 
 from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.deploy.car import acceleration_of
-from mi_nerfattack.deploy.environment import AbstractEnvironment
+from mi_nerfattack.deploy.environment import AbstractEnvironment, trial_numbers
 from mi_nerfattack.deploy.place import Place
 from mi_nerfattack.deploy.registry import environment_versions, make_environment
 from mi_nerfattack.deploy.roadside.surroundings import Surroundings
@@ -313,9 +313,7 @@ def check_policy(policy: AbstractPolicy, place: Place, routes: Sequence[Route]) 
     """
     width, height = place.rig.size
     shape = (1, height, width, 3)
-    image, numbers = mi.TensorXf(np.zeros(shape, np.float32)), None
-    if size := policy.numbers.size:
-        numbers = mi.TensorXf(np.zeros((1, size), np.float32))
+    image, numbers = mi.TensorXf(np.zeros(shape, np.float32)), trial_numbers(policy)
     for route in routes:
         memory = policy.initial_memory(1)
         control, _ = policy.step(image, route.goal, memory, numbers)

@@ -84,8 +84,8 @@ class Trajectory:
         Raises:
             InputError: another number of positions.
         """
-        count, wanted = len(self.times_s), positions.shape[1:].numel()
-        if wanted != 2 * count or positions.ndim not in (2, 3):
+        count = len(self.times_s)
+        if tuple(positions.shape[1:]) not in ((count, 2), (2 * count,)):
             raise InputError(
                 f"policy.trajectory: positions {tuple(positions.shape)}; {count} "
                 "points of two numbers are needed, one for each of times_s"
@@ -165,6 +165,8 @@ class Action:
                 "gives positions in metres"
             )
         columns = self.output if isinstance(self.output, tuple) else (0,)
+        if len(set(columns)) < len(columns):
+            raise InputError(f"policy.output: {list(columns)}; a column stands twice")
         if isinstance(self.scale, tuple) and len(self.scale) != len(columns):
             raise InputError(
                 f"policy.control_scale: {len(self.scale)} factors for "

@@ -79,6 +79,8 @@ def columns_of(
     if count == 1 and values.ndim < 2:  # a network that drops axes of size 1
         values = values.reshape(1, -1)
     shape = tuple(values.shape)
+    if isinstance(output, Sequence) and len(output) == 1:
+        (output,) = output
     if shape != (count,) or isinstance(output, Sequence):
         column = 0 if output is None and shape == (count, 1) else output
         most = max(column) if isinstance(column, Sequence) else column

@@ -16,6 +16,8 @@ from mi_nerfattack.ranges import Count, checked
 #: What the image is called where a vehicle has one camera.
 IMAGE = "image"
 GOAL = "goal"
+#: Names of what `Numbers` has.
+NUMBERS = ("speed", "route", "time")
 
 
 @dataclass(frozen=True)
@@ -39,11 +41,17 @@ class Inputs:
 
     def __post_init__(self) -> None:
         cameras = tuple(self.views) or (IMAGE,)
-        known = (*cameras, *self.numbers.columns, GOAL)
+        if taken := set(cameras) & set(NUMBERS + (GOAL,)):
+            raise InputError(
+                f"cameras: {', '.join(sorted(taken))} is another input of a policy; "
+                "give the camera another name"
+            )
+        known = (*cameras, *NUMBERS, GOAL)
+        missing = {*NUMBERS} - {*self.numbers.columns}
         for name in self.names:
-            if name not in known:
+            if name not in known or name in missing or self.names.count(name) > 1:
                 raise InputError(
-                    f"policy.inputs: {name!r}; there are {', '.join(known)}"
+                    f"policy.inputs: {name!r}; each of {', '.join(known)} at most once"
                 )
         if self.names and not set(self.names) & set(cameras):
             raise InputError(f"policy.inputs: no image; one of {', '.join(cameras)}")

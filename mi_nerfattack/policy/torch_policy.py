@@ -22,7 +22,13 @@ from mi_nerfattack.policy.checks import (
     misfit,
     usual_shape,
 )
-from mi_nerfattack.policy.inputs import AbstractGoal, Inputs, declared_goal
+from mi_nerfattack.policy.inputs import (
+    GOAL,
+    AbstractGoal,
+    Inputs,
+    NoGoal,
+    declared_goal,
+)
 from mi_nerfattack.policy.one_image import OneImage
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.preprocess import Preprocess
@@ -130,6 +136,12 @@ class TorchPolicy(AbstractPolicy):
         self.recurrent: tuple[tuple[int, ...], ...] = check_hidden(recurrent)
         self.action: Action = action or Action()
         self.inputs: Inputs = inputs or Inputs()
+        has_goal, names = not isinstance(self.goal, NoGoal), self.inputs.names
+        if names and has_goal != (GOAL in names):
+            raise InputError(
+                f"{name or type(module).__name__}: policy.goal is {self.goal!r}, and "
+                f"policy.inputs has {', '.join(names)}; let both have a goal, or none"
+            )
         self.numbers: Numbers = self.inputs.numbers
         self.name: str = name or type(module).__name__
         self._checked = False

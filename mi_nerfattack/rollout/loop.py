@@ -239,6 +239,7 @@ class Trajectory:
         kept: what `keep` returned for each control period.
         camera_path: None where the camera was on the vehicle.
         still: the only frame, where the camera path shows a single one.
+        rows: number of rows of a state that costs see; None for all.
     """
 
     states: tuple[Any, ...]
@@ -247,6 +248,7 @@ class Trajectory:
     kept: tuple[Any, ...] = ()
     camera_path: CameraPath | None = None
     still: Observation | None = None
+    rows: int | None = None
 
     def __repr__(self) -> str:
         return (
@@ -297,7 +299,7 @@ class Trajectory:
 
     def history(self) -> StateHistory:
         """Lay all states but the first side by side, detached."""
-        return StateHistory.of(self.states_numpy()[:, 1:], self.dt)
+        return StateHistory.of(self.states_numpy()[:, 1:, : self.rows], self.dt)
 
 
 def simulate(
@@ -358,4 +360,5 @@ def simulate(
         kept=tuple(kept),
         camera_path=camera_path,
         still=still,
+        rows=loop.dynamics.own_rows,
     )

@@ -10,7 +10,7 @@ import numpy as np
 
 from mi_nerfattack.ranges import NonNegative, Whole, checked
 from mi_nerfattack.render.lighting.lights import Sunlight
-from mi_nerfattack.vehicle.dynamics import AbstractDynamics, Dubins
+from mi_nerfattack.vehicle.dynamics import AbstractDynamics, Dubins, rows_type
 
 _STREAM, _SUNS, _LAGS = (
     4,
@@ -142,9 +142,8 @@ class Varied(AbstractDynamics):
     each speed in the same proportion.
 
     With a lag, the steering that acts is one row more, the last: it follows the command
-    by a first-order lag from 0. In a step of length h, the vehicle gets the control's
-    mean, and the row gets what an exact solution has at the end of a step by explicit
-    Euler. So a lag far below h does no harm, where the equation itself would be stiff.
+    by a first-order lag from 0. The lag is at least an integration step, with which all
+    integrators are stable.
 
     Args:
         model: the vehicle.
@@ -170,6 +169,11 @@ class Varied(AbstractDynamics):
         """See :class:`AbstractDynamics`."""
         return self.model.state_size + self._has_lag
 
+    @property
+    def own_rows(self) -> int:
+        """See :class:`AbstractDynamics`."""
+        return self.model.own_rows
+
     def numbered(self, first: int) -> Varied:
         """See :meth:`AbstractDynamics.numbered`."""
         return replace(self, first=first)
@@ -181,15 +185,13 @@ class Varied(AbstractDynamics):
 
     def derivative(self, state: Any, control: Any) -> Any:
         """See :meth:`AbstractDynamics.derivative`."""
-        speed, steering, *lag = self.constants(state)
+        speed, steering, *rate = self.constants(state)
         lagging = []
-        if lag:  # the control's mean over the step, and its slope
-            acting, (share, rate) = state[len(state) - 1], lag
-            several = self.control_size > 1
+        if rate:  # what acts is a row of the state, which follows the command
+            acting, several = state[len(state) - 1], self.control_size > 1
             command, *more = list(control) if several else [control]
-            lagging = [rate * (command - acting)]
-            command = command + share * (acting - command)
-            control = type(control)(command, *more) if several else command
+            lagging = [rate[0] * (command - acting)]
+            control = rows_type(type(acting))(acting, *more) if several else acting
         slope = self.model.derivative(self._without_lag(state), control)
         if not isinstance(self.model, Dubins):
             steering = steering * speed
@@ -220,9 +222,7 @@ class Varied(AbstractDynamics):
             drawn = self.variation.draws(self.first, count)
             numbers = [drawn.speed, drawn.steering]
             if self._has_lag:
-                steps = self.step_s / np.maximum(drawn.lag_s, 1e-9)
-                kept = -np.expm1(-steps)
-                numbers += [kept / steps, kept / self.step_s]
+                numbers += [1 / np.maximum(drawn.lag_s, self.step_s)]
             found = [kind(values.tolist()) for values in numbers]
             dr.make_opaque(found)
             self._uploaded[key] = found

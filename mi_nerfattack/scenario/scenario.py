@@ -41,7 +41,6 @@ from mi_nerfattack.scenario.section import (
     CameraSection,
     NamedCameraSection,
     Section,
-    check_count,
     misfit,
     problems,
     refuse,
@@ -261,7 +260,7 @@ class Scenario(Section):
         policy, taken = self.policy, self.vehicle.unit
         if reason := misfit(policy.unit(), taken, policy.source):
             refuse("vehicle.kind", f"{model} {reason}")
-        check_count(policy.action().count, self.vehicle.car().control_names)
+        policy.check_driven(self.rig().views, self.vehicle.car())
         return self
 
     def _check_cameras(self) -> None:

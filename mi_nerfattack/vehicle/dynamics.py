@@ -52,7 +52,7 @@ def to_control(values: np.ndarray) -> Any:
     """Upload controls (n, k) of n vehicles, opaque: (n,) if k = 1, otherwise (k, n)."""
     row = dr.value_t(state_type())
     rows = [row(column) for column in np.asarray(values, np.float64).T.tolist()]
-    result = rows[0] if len(rows) == 1 else _rows_t(row)(*rows)
+    result = rows[0] if len(rows) == 1 else rows_type(row)(*rows)
     dr.make_opaque(result)
     return result
 
@@ -70,7 +70,7 @@ def controls_as(row: Any, controls: Any) -> Any:
     if dr.depth_v(controls) == 1:
         return row(controls)
     rows = [row(item) for item in controls]
-    return rows[0] if len(rows) == 1 else _rows_t(row)(*rows)
+    return rows[0] if len(rows) == 1 else rows_type(row)(*rows)
 
 
 def no_control(size: int, like: Any) -> Any:
@@ -85,7 +85,7 @@ def no_control(size: int, like: Any) -> Any:
     """
     row = dr.detached_t(type(like[0]))
     rows = [dr.opaque(row, 0, dr.width(like)) for _ in range(size)]
-    return rows[0] if size == 1 else _rows_t(row)(*rows)
+    return rows[0] if size == 1 else rows_type(row)(*rows)
 
 
 def control_size(control: Any) -> int:
@@ -93,7 +93,7 @@ def control_size(control: Any) -> int:
     return 1 if dr.depth_v(control) == 1 else len(control)
 
 
-def _rows_t(row: Any) -> Any:
+def rows_type(row: Any) -> Any:
     """Type of an array of any number of rows: `ArrayXf64` for a row `Float64`."""
     return getattr(sys.modules[row.__module__], _ROWS[dr.type_v(row)])
 
@@ -167,6 +167,11 @@ class AbstractDynamics(ABC):
         """Number m of rows of a state; the first three are px, py, theta."""
         return 3
 
+    @property
+    def own_rows(self) -> int:
+        """Number of rows that costs see; the others are those of a `Variation`."""
+        return self.state_size
+
     def extend(self, poses: np.ndarray) -> np.ndarray:
         """Complete poses to states at rest in all other rows.
 
@@ -233,7 +238,7 @@ class AbstractDynamics(ABC):
         Differentiable; with the control 0, which moves no vehicle at once.
         """
         none, size = dr.zeros(type(state[0]), dr.width(state)), self.control_size
-        control = none if size == 1 else _rows_t(type(none))(*[none] * size)
+        control = none if size == 1 else rows_type(type(none))(*[none] * size)
         slope = self.derivative(state, control)
         sin, cos = dr.sincos(state[2])
         return slope[0] * cos + slope[1] * sin

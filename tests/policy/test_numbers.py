@@ -121,10 +121,39 @@ def test_functions_get_what_they_name(rng):
         policy.step(frame, 0, memory)
 
 
-@pytest.mark.parametrize("names", [("image",), ("front", "sonar"), ("speed",)])
+@pytest.mark.parametrize(
+    "names", [("image",), ("front", "sonar"), ("speed",), ("front", "front")]
+)
 def test_unknown_inputs_are_refused(names):
-    with pytest.raises(InputError, match="there are front, left|no image"):
+    with pytest.raises(InputError, match="each of front, left, .* once|no image"):
         Inputs(names, TOLD, VIEWS)
+
+
+def test_what_contradicts_itself_is_refused():
+    with pytest.raises(InputError, match="cameras: speed is another input"):
+        Inputs((), TOLD, {"speed": VIEWS["front"]})
+    with pytest.raises(InputError, match="let both have a goal, or none"):
+        TorchPolicy(nn.Flatten(), IntegerGoal(3), inputs=Inputs(("image",)))
+    with pytest.raises(InputError, match="a column stands twice"):
+        Action((0, 0))
+    with pytest.raises(InputError, match="4 points of two numbers"):
+        CAR.follow(torch.zeros(1, 2, 4), torch.ones(1))
+
+
+def test_one_column_in_a_list_is_one_control():
+    policy = TorchPolicy(nn.Flatten(), action=Action((1,)))
+    image = mi.TensorXf([0.1, 0.2, 0.3], (1, 1, 1, 3))
+    control, _ = policy.step(image, 0, ())
+    d_image, _, _ = policy.step_vjp(image, 0, (), 0 * control + 1, ())
+    assert control[0] == pytest.approx(0.2)
+    np.testing.assert_array_equal(d_image.numpy().ravel(), [0, 1, 0])
+
+
+def test_a_server_gets_the_numbers_that_are_named():
+    from mi_nerfattack.policy.http.policy import HttpPolicy
+
+    inputs = Inputs(("image", "time"), Numbers(speed=True, time=True))
+    assert HttpPolicy("http://localhost", inputs=inputs).sent == ("time",)
 
 
 CAR = Trajectory(

@@ -81,6 +81,13 @@ route = "lane" -> => :2: scene.route: is missing
 [vehicle]; kind = "kinematic_single_track"; [policy]; file = "a.pt"
   => policy.output: .*gives 1, .*takes 2: steering, acceleration
 [policy]; file = "a.pt"; output = [0, 1] => policy.output: .*gives 2, .*1: heading_rate
+[vehicle]; kind = "ackermann"; wheelbase_m = 0.26; [policy]; file = "a.pt"
+  [policy.trajectory]; times_s = [1.0]; controls = ["steering"]
+  => policy.trajectory.wheelbase_m: is 2.7; the vehicle's is 0.26
+[policy]; file = "a.pt"; inputs = ["imaeg"]
+  => policy.inputs: 'imaeg'; each of image, speed
+[policy]; file = "a.pt"; [policy.trajectory]; times_s = [1.0]; speed_gain = 2.0
+  => trajectory.speed_gain: has no effect on heading_rate
 [policy]; file = "a.pt"; output = [0, -1] => policy.output.1: .*equal to 0
 [vehicle]; delay_steps = -1 => vehicle.delay_steps: .*0
 [vehicle]; kind = "ackermann_rate"; steer_time_s = 0.03; substeps = 1

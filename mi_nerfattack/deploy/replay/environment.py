@@ -106,6 +106,11 @@ class ReplayEnvironment(AbstractEnvironment):
         """Speed between the frames before and after, along the heading."""
         track, last = self.recording.track, len(self._states) - 1
         before, after = max(self._index - 1, 0), min(self._index + 1, last)
+        if before == after:
+            raise InputError(
+                f"{track.where}: has one frame, and so no speed, which the policy "
+                "takes; give a longer recording"
+            )
         moved = self._states[after, :2] - self._states[before, :2]
         heading = self.state[2]
         along = moved @ np.array([math.cos(heading), math.sin(heading)])

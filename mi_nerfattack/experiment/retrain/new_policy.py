@@ -8,11 +8,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 import tomlkit
 
-from mi_nerfattack.deploy.environment import policy_image
+from mi_nerfattack.deploy.environment import policy_image, trial_numbers
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.retrain.compare import read_with_policy
 from mi_nerfattack.experiment.transfer.found import FoundAttack
@@ -127,9 +126,8 @@ def try_policy(found: FoundAttack, setting: str, attacked_again: bool) -> str:
     else:
         policy = scenario.policy.build(rig.views)
     width, height = rig.size
-    image, numbers = policy_image(np.full((height, width, 3), 128, np.uint8)), None
-    if size := policy.numbers.size:
-        numbers = mi.TensorXf(np.ones((1, size), np.float32))
+    image = policy_image(np.full((height, width, 3), 128, np.uint8))
+    numbers = trial_numbers(policy)
     row, _ = policy.step(image, found.route.goal, policy.initial_memory(1), numbers)
     if not np.isfinite(np.array(row)).all():
         raise InputError(f"{scenario.policy.source}: gives the control {np.array(row)}")

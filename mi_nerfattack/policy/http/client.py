@@ -234,7 +234,7 @@ class PolicyClient:
             text = raw[:80].decode("utf-8", "replace")
             raise InputError(
                 f"{self.url}: answers {text!r} ({type(err).__name__}: {err}); "
-                'must be JSON, {"control": [one number for each image]}'
+                'must be JSON, {"control": [one number, or a list, for each image]}'
             ) from err
 
 

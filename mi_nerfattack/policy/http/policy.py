@@ -20,8 +20,9 @@ class HttpPolicy(AbstractBlackBox):
         url: http or https.
         timeout_s: longest wait for a whole answer.
         retries: how often a failed request is repeated.
-        preprocess: as for `AbstractBlackBox`; action and inputs likewise. The server
-            gets the frame as it is, images of several cameras side by side.
+        preprocess: as for `AbstractBlackBox`; action likewise.
+        inputs: the server gets the numbers that it names, and the frame as it is,
+            images of several cameras side by side.
         token: that the server wants.
     """
 
@@ -36,13 +37,16 @@ class HttpPolicy(AbstractBlackBox):
         token: str = "",
     ) -> None:
         self.client: PolicyClient = PolicyClient(url, token, timeout_s, retries)
-        inputs = Inputs(numbers=(inputs or Inputs()).numbers)
-        AbstractBlackBox.__init__(self, url, preprocess, action, inputs)
+        named, numbers = (inputs or Inputs()).names, (inputs or Inputs()).numbers
+        self.sent: tuple[str, ...] = tuple(k for k in numbers.columns if k in named)
+        AbstractBlackBox.__init__(
+            self, url, preprocess, action, Inputs(numbers=numbers)
+        )
 
     def answer(
         self, given: Mapping[str, np.ndarray], goals: np.ndarray, step: int
     ) -> np.ndarray:
         """Ask the server."""
-        told = [given[name].reshape(len(goals), -1) for name in self.numbers.columns]
+        told = [given[name].reshape(len(goals), -1) for name in self.sent]
         numbers = np.hstack(told) if told else None
         return self.client.ask(given[IMAGE], goals.tolist(), step, numbers)

@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, model_validator
 
+from mi_nerfattack.deploy.car import Car
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.action import Action, Trajectory
 from mi_nerfattack.policy.base import AbstractPolicy, Numbers
@@ -18,7 +19,14 @@ from mi_nerfattack.scenario.policy.parts import (
     PreprocessSection,
     TrajectorySection,
 )
-from mi_nerfattack.scenario.section import OneOrSeveral, Section, Trust, Unit, refuse
+from mi_nerfattack.scenario.section import (
+    OneOrSeveral,
+    Section,
+    Trust,
+    Unit,
+    check_count,
+    refuse,
+)
 
 Views = Mapping[str, tuple[slice, slice]]
 NO_VIEWS: Views = {}
@@ -88,6 +96,28 @@ class AbstractPolicySection(Section):
         numbers = Numbers(speed, self.route_m, "time" in self.inputs)
         return Inputs(self.inputs, numbers, views)
 
+    def check_driven(self, views: Views, car: Car) -> None:
+        """Refuse what does not go with a vehicle's cameras and controls.
+
+        Args:
+            views: as of :meth:`build`.
+            car: the vehicle's.
+        """
+        try:
+            self.given(views)
+        except InputError as error:
+            refuse("policy.inputs", str(error).partition("policy.inputs: ")[2])
+        check_count(self.action().count, car.control_names)
+        follower = self._follower()
+        steers = car.control_names[0] == "steering"  # the units were compared before
+        if follower is not None and steers:
+            ratio = follower.wheelbase_m / car.wheelbase
+            if not 0.99 < ratio < 1.01:
+                refuse(
+                    "policy.trajectory.wheelbase_m",
+                    f"is {follower.wheelbase_m:g}; the vehicle's is {car.wheelbase:g}",
+                )
+
     @model_validator(mode="after")
     def _check_parts(self) -> Any:
         """Refuse points that are not told, or told without distances."""
@@ -117,3 +147,9 @@ class AbstractPolicySection(Section):
             self._follower()
         except InputError as error:
             refuse("trajectory", str(error))
+        section, usual = self.trajectory, self.trajectory.defaults()
+        unused = ["wheelbase_m"] if section.controls[0] == "heading_rate" else []
+        unused += ["speed_s", "speed_gain"] if len(section.controls) == 1 else []
+        for key in unused:
+            if getattr(section, key) != usual[key]:
+                refuse(f"trajectory.{key}", f"has no effect on {section.controls[0]}")

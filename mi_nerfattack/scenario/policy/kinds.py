@@ -241,7 +241,7 @@ class HttpSection(AbstractPolicySection):
             self.retries,
             self.preprocess.build(),
             self.action(),
-            self.given(views),
+            self.given(NO_VIEWS),  # the server gets the frame as it is
             "" if self.token_file is None else read_token(self.token_file.file),
         )
 

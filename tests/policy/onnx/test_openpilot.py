@@ -116,7 +116,7 @@ def test_drives_are_those_of_onnxruntime(pair, keys, tmp_path, rng, variant):
     twins = [Runtime(pair, *order, traffic, delay) for _ in range(2)]
     memory, seen = policy.initial_memory(2), []
     for _ in range(7):
-        frame = rng.integers(0, 256, (2, 20, 44, 3)).astype("f4") / 255
+        frame = rng.integers(0, 256, (2, 18, 44, 3)).astype("f4") / 255
         speed = np.array([6.0, 9.0])
         numbers = mi.TensorXf(speed[:, None])
         control, memory = policy.step(mi.TensorXf(frame), 0, memory, numbers)
