@@ -54,7 +54,7 @@ class Retrain:
     ]
     """Folders of finished runs of attack, on one policy, in one place."""
     output: Path
-    """Policy file to write: of the suffix of the old one, or .toml."""
+    """Policy to write: suffix as before, or .toml."""
     data: Path
     """Folder of new frames and checkpoints; made if missing."""
     command: str | None = None
