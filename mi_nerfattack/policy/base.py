@@ -85,7 +85,7 @@ class AbstractPolicy(ABC):
             image: as for `control`.
             goal: as for `control`.
             memory: from `initial_memory` or the step before; left unchanged.
-            numbers: tensor (n, k) of the columns of :attr:`numbers`; None without.
+            numbers: tensor (n, k) of the columns of `Numbers`; None without.
 
         Returns:
             The control, as `control` gives it, and the memory for the next step.

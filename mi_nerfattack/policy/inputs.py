@@ -91,7 +91,7 @@ class Inputs:
         Args:
             images: by name.
             goals: the goal as the network takes it, or none.
-            numbers: (n, k), columns of :attr:`numbers`.
+            numbers: (n, k), columns of `Numbers`.
         """
         told = self.told(numbers)
         names = self.names or (*images, GOAL)

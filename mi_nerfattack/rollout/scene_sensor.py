@@ -125,7 +125,7 @@ class SceneSensor(AbstractDifferentiableSensor):
 
         All cameras of a vehicle are raised and pitched alike. The light varies on the
         :attr:`objects` that there are now. Where it has a sun, objects that have no
-        `LightMaps` get those of :func:`light_maps`.
+        `LightMaps` get some, made of their field.
 
         Raises:
             InputError: light on objects, and there are none.

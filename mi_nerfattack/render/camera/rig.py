@@ -140,11 +140,11 @@ class Rig:
         return dict(zip(self.names, places, strict=True))
 
     def split(self, frame: Any) -> dict[str, Any]:
-        """Return the images of a frame by name; see :meth:`Layout.split`."""
+        """Return the images of a frame by name, see `Layout`; slices alone."""
         return dict(zip(self.names, self.layout.split(frame), strict=True))
 
     def join(self, images: dict[str, np.ndarray], below: float = 0) -> np.ndarray:
-        """Lay images by name side by side; see :meth:`Layout.join`."""
+        """Lay images by name side by side, with `below` under lower ones."""
         return self.layout.join([images[name] for name in self.names], below)
 
     @property
