@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import mitsuba as mi
@@ -17,7 +17,7 @@ from mi_nerfattack.deploy.car import Control, control_names
 from mi_nerfattack.deploy.vehicle import Controls
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.base import AbstractPolicy
-from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
 from mi_nerfattack.render.camera.rig import Layout, Rig
 from mi_nerfattack.rollout.drive import Drive
 from mi_nerfattack.rollout.loop import numbers_of, stacked
@@ -142,8 +142,7 @@ class AbstractEnvironment(ABC):
 
     Attributes:
         name: "surrogate", "mitsuba", "mujoco", ...
-        rig: the cameras whose images are observed, side by side.
-        camera: intrinsics of the first of them.
+        camera: intrinsics of the observed images, of several the first ones.
         period: seconds between two images.
         max_control: largest control that has an effect, in the unit that `step` takes;
             of several controls, the first one's.
@@ -152,12 +151,16 @@ class AbstractEnvironment(ABC):
     """
 
     name: str
-    rig: Rig
     camera: Camera
     period: float
     max_control: float
     control_unit: str
     more_controls: tuple[Control, ...] = ()
+
+    @cached_property
+    def rig(self) -> Rig:
+        """The cameras whose images are observed, side by side; by default one."""
+        return Rig.of_one(self.camera, CameraMount())
 
     @property
     def control_names(self) -> tuple[str, ...]:

@@ -39,7 +39,7 @@ class AbstractSimulation(AbstractEnvironment):
     ) -> None:
         self.name: str = name
         self.vehicle: AbstractVehicle = vehicle
-        self.rig: Rig = rig
+        self.rig = rig
         self.camera: Camera = rig.cameras[0]
         self.period: float = period
         self.max_control: float = vehicle.max_control
