@@ -9,6 +9,7 @@ back ends the process.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any
@@ -113,6 +114,14 @@ def upload_rows(kind: Any, rows: np.ndarray) -> Any:
     """Return vectors of a type, such as `mi.Point3f`, from rows (n, m)."""
     column = dr.value_t(kind)
     return kind(*[column(values) for values in rows.T.tolist()])
+
+
+def rows_type(row: Any) -> Any:
+    """Type of an array of any number of rows: `ArrayXf64` for a row `Float64`."""
+    return getattr(sys.modules[row.__module__], _ROWS[dr.type_v(row)])
+
+
+_ROWS = {dr.VarType.Float32: "ArrayXf", dr.VarType.Float64: "ArrayXf64"}
 
 
 def adam_tensors(optimiser: Adam) -> dict[str, np.ndarray]:

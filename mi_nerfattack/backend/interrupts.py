@@ -8,11 +8,14 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 #: Seconds in which code outside Python must come back to it after a signal.
 GRACE_S = 5.0
+
+Handler = Callable[[int, FrameType | None], object]
 
 
 @contextmanager
@@ -69,6 +72,34 @@ def _watch(
 
 
 @contextmanager
+def _between(
+    handle: Callable[[Handler, int, FrameType | None], None],
+) -> Iterator[None]:
+    """Let signals come to a function before their handlers in Python.
+
+    In the main thread alone, where they arrive.
+
+    Args:
+        handle: called with the handler, the signal's number and the frame.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before: dict[int, Handler] = {}
+    for number in SIGNALS:
+        handler = signal.getsignal(number)
+        if callable(handler):
+            before[number] = handler
+    for number, handler in before.items():
+        signal.signal(number, partial(handle, handler))
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
 def noticed_interrupts() -> Iterator[None]:
     """Let Ctrl-C and SIGTERM arrive, and raise at the end what the code has caught.
 
@@ -78,26 +109,13 @@ def noticed_interrupts() -> Iterator[None]:
         KeyboardInterrupt: one came, whatever the code made of it.
     """
     came: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before: dict[int, Callable[[int, FrameType | None], object]] = {}
-    for number in SIGNALS:
-        handler = signal.getsignal(number)
-        if callable(handler):
-            before[number] = handler
 
-    def notice(number: int, frame: FrameType | None) -> None:
+    def notice(handler: Handler, number: int, frame: FrameType | None) -> None:
         came.append(number)
-        before[number](number, frame)
+        handler(number, frame)
 
-    for number in before:
-        signal.signal(number, notice)
-    try:
+    with _between(notice):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
     if came:
         raise KeyboardInterrupt
 
@@ -124,28 +142,14 @@ def held_interrupts(*, all_of_them: bool = False) -> Iterator[Callable[[], None]
             came.clear()
             raise KeyboardInterrupt
 
-    if threading.current_thread() is not threading.main_thread():
-        yield check
-        return
-    before: dict[int, Callable[[int, FrameType | None], object]] = {}
-    for number in SIGNALS:
-        handler = signal.getsignal(number)
-        if callable(handler):
-            before[number] = handler
-
-    def hold(number: int, frame: FrameType | None) -> None:
+    def hold(handler: Handler, number: int, frame: FrameType | None) -> None:
         try:
-            before[number](number, frame)
+            handler(number, frame)
         except KeyboardInterrupt:
             if came and not all_of_them:
                 raise
             came.append(number)
 
-    for number in before:
-        signal.signal(number, hold)
-    try:
+    with _between(hold):
         yield check
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
     check()

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import drjit as dr
 import torch
+
+from mi_nerfattack.backend.arrays import rows_type
 
 
 def to_torch(array: Any) -> torch.Tensor:
@@ -34,8 +35,7 @@ def to_controls(value: torch.Tensor, like: Any) -> Any:
     """Make a row (n,) of controls (n,), k rows (k, n) of controls (n, k)."""
     if value.ndim == 1:
         return to_row(value, like)
-    kind: Any = sys.modules[type(like).__module__]
-    rows = kind.ArrayXf64 if dr.type_v(like) == dr.VarType.Float64 else kind.ArrayXf
+    rows = rows_type(dr.array_t(like))
     return rows(*(to_row(column, like) for column in value.unbind(1)))
 
 

@@ -8,9 +8,10 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from mi_nerfattack.backend.arrays import rows_type
 from mi_nerfattack.ranges import NonNegative, Whole, checked
 from mi_nerfattack.render.lighting.lights import Sunlight
-from mi_nerfattack.vehicle.dynamics import AbstractDynamics, Dubins, rows_type
+from mi_nerfattack.vehicle.dynamics import AbstractDynamics, Dubins
 
 _STREAM, _SUNS, _LAGS = (
     4,

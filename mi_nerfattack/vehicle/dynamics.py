@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.backend.arrays import upload_rows
+from mi_nerfattack.backend.arrays import rows_type, upload_rows
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Acute, Positive, checked
 
@@ -91,14 +91,6 @@ def no_control(size: int, like: Any) -> Any:
 def control_size(control: Any) -> int:
     """Return the number of controls in (n,) or (k, n)."""
     return 1 if dr.depth_v(control) == 1 else len(control)
-
-
-def rows_type(row: Any) -> Any:
-    """Type of an array of any number of rows: `ArrayXf64` for a row `Float64`."""
-    return getattr(sys.modules[row.__module__], _ROWS[dr.type_v(row)])
-
-
-_ROWS = {dr.VarType.Float32: "ArrayXf", dr.VarType.Float64: "ArrayXf64"}
 
 
 def require_controls(given: int, names: Sequence[str]) -> None:

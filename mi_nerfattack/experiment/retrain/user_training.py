@@ -215,7 +215,7 @@ class ModuleTraining(AbstractUserTraining):
                 f"{self.option}: {self.name}: ends the program ({err.code}); let it "
                 "return when it has written its file, or raise an exception"
             ) from err
-        except Exception as err:
+        except Exception as err:  # a user's training raises whatever it likes
             if is_interrupt(err) or isinstance(err, InputError):
                 raise
             raise InputError(
