@@ -6,6 +6,9 @@ import ipaddress
 import os
 import socket
 import sys
+import threading
+import time
+from contextlib import suppress
 from dataclasses import dataclass
 from http.server import ThreadingHTTPServer
 from pathlib import Path
@@ -15,6 +18,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 
 DEFAULT_PORT = 8000
+_END_S = 10.0  # in which a handler must return when its server closes
 _TOKEN_SIZES = 16, 4096  # bytes
 _MAKE_TOKEN = (
     "make one with 'openssl rand -hex 32 > policy.token; chmod 600 policy.token', and "
@@ -69,7 +73,7 @@ class Endpoint:
 
 
 class HttpServer(ThreadingHTTPServer):
-    """Server with one thread for each connection, which end with the process.
+    """Server with one thread for each connection.
 
     Args:
         endpoint: to listen at.
@@ -79,12 +83,10 @@ class HttpServer(ThreadingHTTPServer):
         InputError: it cannot listen there.
     """
 
-    daemon_threads = True
-    block_on_close = False
-
     def __init__(self, endpoint: Endpoint, handler: Any) -> None:
         if ":" in endpoint.host:
             self.address_family = socket.AF_INET6
+        self._connections: dict[Any, threading.Thread] = {}
         try:
             super().__init__((endpoint.host, endpoint.port), handler)
         except OSError as error:
@@ -93,9 +95,36 @@ class HttpServer(ThreadingHTTPServer):
                 "--listen"
             ) from error
 
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Start a thread for a connection."""
+        thread = threading.Thread(
+            target=self.process_request_thread,
+            args=(request, client_address),
+            daemon=True,
+        )
+        self._connections[request] = thread
+        thread.start()
+
+    def shutdown_request(self, request: Any) -> None:
+        """Close a connection."""
+        self._connections.pop(request, None)
+        super().shutdown_request(request)
+
     def close(self) -> None:
-        """Let go of the port."""
+        """Let go of the port, answer what came, and wait for the threads.
+
+        A thread that Python ends at its own exit, while C++ calls it, aborts the
+        process. A handler that does not return within `_END_S` is left behind.
+        """
         self.server_close()
+        connections = list(self._connections.items())
+        for request, _ in connections:
+            with suppress(OSError):  # the client has left
+                request.shutdown(socket.SHUT_RD)
+        end = time.monotonic() + _END_S
+        for _, thread in connections:
+            if thread.is_alive():  # Ctrl-C may come before its start
+                thread.join(max(end - time.monotonic(), 0.0))
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Print no error of a client that has left."""

@@ -186,7 +186,7 @@ class FollowServer:
         if not self._closed.is_set():
             self._closed.set()
             self._server.shutdown()
-            self._server.server_close()
+            self._server.close()
 
     def _tell(self, pose: TrackedPose | None) -> None:
         lost = pose is None or time.monotonic() - pose.time_s > STALE_S

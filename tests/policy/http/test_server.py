@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import socket
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 
 import mitsuba as mi
@@ -128,6 +129,24 @@ def test_strangers_get_status_401(token):
         figures = server.figures()
         assert (figures["strangers"], figures["decisions"]) == (1, 0)
         assert asked(PolicyClient(url, TOKEN), 0.5, 0) == 0.5
+
+
+def test_a_server_that_closes_answers_first():
+    began, go = threading.Event(), threading.Event()
+
+    class Waiting(nn.Module):
+        def forward(self, image):
+            began.set()
+            assert go.wait(10)
+            return image.mean((1, 2, 3))
+
+    with ThreadPoolExecutor() as pool:
+        with serving(TorchPolicy(Waiting())) as (server, url):
+            answer = pool.submit(asked, PolicyClient(url, TOKEN), 0.5, 0)
+            assert began.wait(10)
+            threading.Timer(0.3, go.set).start()
+        assert server.figures()["decisions"] == 1  # before `close` returned
+        assert answer.result() == 0.5
 
 
 def token_of(text: str, mode: int = 0o600):
