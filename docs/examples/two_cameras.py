@@ -1,7 +1,6 @@
-"""A policy of two cameras and the speed that gives waypoints, and its training.
+"""Cameras and speed in, waypoints out: `two_cameras.py OUT [FRAMES [START]]` trains.
 
-`two_cameras.py OUT` writes the weights that training starts with, `two_cameras.py OUT
-FRAMES [START]` trains on a folder of frames.
+Without frames, OUT gets untrained weights.
 """
 
 import sys
@@ -13,35 +12,31 @@ from torch.utils.data import DataLoader
 
 import mi_nerfattack as nf
 
-EPOCHS = 12
-
 
 class Net(nn.Module):
-    """Images of 200x66 and 100x66 and the speed (n, 1) in, positions (n, 4, 2) out."""
+    """Images 200x66 and 100x66 and speed (n, 1) to (n, 4, 2) metres ahead and left."""
 
     def __init__(self):
         super().__init__()
         layers = [nn.Conv2d(3, 24, 5, 2), nn.ELU(), nn.Conv2d(24, 36, 5, 2), nn.ELU()]
         layers += [nn.Conv2d(36, 48, 3, 2), nn.ELU(), nn.Conv2d(48, 48, 3), nn.ELU()]
         self.eye = nn.Sequential(*layers, nn.Flatten())
-        self.head = nn.Sequential(nn.Linear(48 * 4 * (21 + 8) + 1, 64), nn.ELU())
-        self.path = nn.Linear(64, 8)
-        self.seconds = (0.5, 1.0, 1.5, 2.0)
+        middle = nn.Linear(48 * 4 * (21 + 8) + 1, 64)
+        self.head = nn.Sequential(middle, nn.ELU(), nn.Linear(64, 8))
 
     def forward(self, front, wide, speed):
         seen = [self.eye(2 * image - 1) for image in (front, wide)]
-        steps = self.path(self.head(torch.cat([*seen, speed / 10], 1)))
-        straight = speed[:, None] * steps.new_tensor(self.seconds)[:, None]
-        ahead = torch.cat([straight, torch.zeros_like(straight)], 2)
-        return ahead + steps.unflatten(1, (4, 2))  # metres forward, to the left
+        steps = self.head(torch.cat([*seen, speed / 10], 1))
+        straight = speed[:, None] * steps.new_tensor([[0.5], [1.0], [1.5], [2.0]])
+        return nn.functional.pad(straight, (0, 1)) + steps.unflatten(1, (4, 2))
 
 
-def train(network, data):
+def train(network, data, epochs=12):
     """Imitate the expert's positions on frames, two images side by side in each."""
     frames = nf.frames(data)
     adam = torch.optim.Adam(network.parameters(), lr=1e-3)
-    rate = torch.optim.lr_scheduler.OneCycleLR(adam, 2e-3, EPOCHS * (len(frames) // 32))
-    for epoch in range(EPOCHS):
+    rate = torch.optim.lr_scheduler.OneCycleLR(adam, 2e-3, epochs * (len(frames) // 32))
+    for epoch in range(epochs):
         total = 0.0
         for batch in DataLoader(frames, 32, shuffle=True, drop_last=True):
             front, wide = batch.image.split([200, 100], dim=3)
