@@ -51,7 +51,7 @@ def test_examples_are_short(script):
 def test_tables_user(tmp_path):
     *means, worst = printed("tables_user", tmp_path)
     page = (DOCS / "table2" / "README.md").read_text("utf-8")
-    _, _, page = page.partition("## Deployment")
+    _, _, page = page.partition("## mitsuba")
     header = next(x for x in page.splitlines() if x.startswith("| route |"))
     column = [name.strip() for name in header.split("|")].index("attack")
     for route, mean in zip(("straight", "right", "left"), means, strict=True):
