@@ -125,14 +125,11 @@ def read_table(path: Path) -> pd.DataFrame:
             "which makes the table again"
         )
     old = table.loc[table["environment"] == "deployment", "cell"]
-    if not old.empty:
-        made = read_made(path.parent)
-        texts = {cell: made[cell]["scenario"] for cell in old.unique()}
-        names = {
-            cell: upgraded_environment("deployment", parse_toml(cell, text))
-            for cell, text in texts.items()
-        }
-        table.loc[old.index, "environment"] = old.map(names)
+    made = read_made(path.parent) if len(old) else {}
+    for cell, rows in old.groupby(old):
+        scenario = parse_toml(cell, made[cell]["scenario"])
+        name = upgraded_environment("deployment", scenario)
+        table.loc[rows.index, "environment"] = name
     return with_total(table)
 
 
