@@ -7,7 +7,7 @@ from mi_nerfattack.experiment.sweep.sweep import FinishedSweep
 
 folder = Path(__file__).parents[1] / "table2"  # of a sweep, or a copy of its tables
 drives = FinishedSweep(folder).drives  # a DataFrame with one row per drive
-drives = drives[drives["environment"] == "deployment"]
+drives = drives[drives["environment"] == "mitsuba"]
 
 # An attack is a cell of the sweep: its drives are averaged first.
 figures = nf.summary(drives, by=["route", "case"], once=["cell"])

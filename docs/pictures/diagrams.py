@@ -77,7 +77,7 @@ def places_chart(table: pd.DataFrame) -> Figure:
     Args:
         table: of a sweep; a place is a route and a seed.
     """
-    driven = table[table["environment"] == "deployment"]
+    driven = table[table["environment"] == "mitsuba"]
     number = driven.groupby(["route", "seed"], sort=False).ngroup()
     places = list(driven[["route", "seed"]].drop_duplicates().itertuples(index=False))
     routes = dict.fromkeys(driven["route"])

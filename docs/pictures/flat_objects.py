@@ -8,7 +8,6 @@ import numpy as np
 from images import write_jpeg
 from PIL import Image
 
-from mi_nerfattack.scenario.deployment import DEPLOYMENT, SURROGATE
 from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.scenario.world import build_world
 
@@ -30,7 +29,7 @@ def draw_flat(folder: Path, small: bool) -> None:
     scenario, _ = load_scenario(SCENARIO, settings=settings)
     world = build_world(scenario, scenario.build_policy())
     images = []
-    for label in (SURROGATE, DEPLOYMENT):
+    for label in world.labels:
         environment = world.open(label)
         frame = environment.reset(world.route, world.route.pose_at(ARC_M), 0)
         images.append(frame.image)

@@ -41,7 +41,7 @@ def draw_banner(run: Path, folder: Path, small: bool) -> None:
     size = (300, 180) if small else (596, 360)
     panels = []
     for case in TITLES:
-        scene = scene_of_drive(viewed, drive_of(viewed, "deployment", case))
+        scene = scene_of_drive(viewed, drive_of(viewed, "mitsuba", case))
         renderer = ViewRenderer(scene, from_fov(*size, FOV_DEG))
         rgb = renderer.render(look_at(EYE_M, TARGET_M), 8 if small else 256, 0).rgb
         panels.append(titled(Image.fromarray(linear_to_uint8(rgb)), TITLES[case]))

@@ -28,7 +28,7 @@ class View:
     """Write one HTML file, which opens by itself, and end: the scene, with one drive
     that plays."""
     drive: str | None = None
-    """Shown first, or written: ENVIRONMENT: CASE, as "deployment: attack"; past the
+    """Shown first, or written: ENVIRONMENT: CASE, as "mitsuba: attack"; past the
     attack in the surrogate by default."""
     host: str = "127.0.0.1"
     """Name or address to listen at. Whoever gets there sees the run and moves its

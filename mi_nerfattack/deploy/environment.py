@@ -309,7 +309,7 @@ def drive(
     states, controls = [environment.state], []
     for index in range(steps):
         image = policy_image(frame.image)
-        numbers = told(policy, environment, route, index)
+        numbers = policy_numbers(policy, environment, route, index)
         row, memory = policy.step(image, route.goal, memory, numbers)
         controls.append(single_control(row, environment.control_names))
         frame = environment.step(controls[-1])
@@ -346,15 +346,15 @@ def single_control(row: Any, names: Sequence[str]) -> float | np.ndarray:
     return float(values[0]) if len(values) == 1 else values
 
 
-def told(
+def policy_numbers(
     policy: AbstractPolicy, environment: AbstractEnvironment, route: Route, step: int
 ) -> Any:
-    """Return what a policy is told besides the image, (1, k); None for nothing.
+    """Return the numbers that a policy asks for, (1, k); None if it asks for none.
 
     Args:
         policy: that asks.
         environment: in which it drives.
-        route: that it is told points of.
+        route: whose points the policy gets.
         step: control periods since the start.
 
     Raises:

@@ -75,7 +75,7 @@ class AbstractBlackBox(AbstractPolicy):
         """Pre-process the images on the CPU and ask."""
         images = to_torch(image).to("cpu", torch.float32)
         check_images(images)
-        told = None if numbers is None else to_torch(numbers).to("cpu", torch.float32)
+        rows = None if numbers is None else to_torch(numbers).to("cpu", torch.float32)
         given, stacks = {}, []
         with torch.no_grad():
             pictures = self.inputs.pictures(images).items()
@@ -85,7 +85,7 @@ class AbstractBlackBox(AbstractPolicy):
                 # a copy: functions may write into their image
                 given[name] = np.array(seen.numpy(), order="C")
                 stacks.append(past)
-            numbers_by_name = self.inputs.told(told)
+            numbers_by_name = self.inputs.by_name(rows)
             given |= {key: np.array(v.numpy()) for key, v in numbers_by_name.items()}
             goals = expand_goals(goal, images).numpy().copy()
             answer = self.answer(given, goals, memory[0])

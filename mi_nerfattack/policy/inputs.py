@@ -93,17 +93,17 @@ class Inputs:
             goals: the goal as the network takes it, or none.
             numbers: (n, k), columns of `Numbers`.
         """
-        told = self.told(numbers)
+        columns = self.by_name(numbers)
         names = self.names or (*images, GOAL)
         found: list[torch.Tensor] = []
         for name in names:
             if name == GOAL:
                 found += goals
             else:
-                found.append(images[name] if name in images else told[name])
+                found.append(images[name] if name in images else columns[name])
         return tuple(found)
 
-    def told(self, numbers: Any) -> dict[str, Any]:
+    def by_name(self, numbers: Any) -> dict[str, Any]:
         """Return columns (n, k) of torch or NumPy by name, of points as (n, k, 2).
 
         Raises:
@@ -114,7 +114,7 @@ class Inputs:
         if numbers is None or numbers.shape[-1] != self.numbers.size:
             shape = None if numbers is None else tuple(numbers.shape)
             raise InputError(
-                f"policy: it is told {', '.join(self.numbers.columns)}, "
+                f"policy: it asks for {', '.join(self.numbers.columns)}, "
                 f"{self.numbers.size} numbers, and gets {shape}; this way of driving "
                 "it does not know them"
             )

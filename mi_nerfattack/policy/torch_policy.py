@@ -175,10 +175,10 @@ class TorchPolicy(AbstractPolicy):
         self, image: Any, goal: Any, memory: Memory, numbers: Any = None
     ) -> tuple[Any, Memory]:
         """Evaluate the module without recording a graph."""
-        told = None if numbers is None else to_torch(numbers)
-        self._check(image, goal, memory, told)
+        rows = None if numbers is None else to_torch(numbers)
+        self._check(image, goal, memory, rows)
         with torch.no_grad():
-            control, after = self._evaluate(to_torch(image), goal, memory, told)
+            control, after = self._evaluate(to_torch(image), goal, memory, rows)
         return to_controls(control, image), after
 
     def planes(self, image: Any, memory: Memory) -> np.ndarray:
@@ -220,9 +220,9 @@ class TorchPolicy(AbstractPolicy):
         numbers: Any = None,
     ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
         """Return the control, and derivatives by image, memory parts and numbers."""
-        told = () if numbers is None else (to_torch(numbers),)
-        self._check(image, goal, memory, *told)
-        parts = (to_torch(image), *memory, *told)
+        rows = () if numbers is None else (to_torch(numbers),)
+        self._check(image, goal, memory, *rows)
+        parts = (to_torch(image), *memory, *rows)
         leaves = [part.detach().requires_grad_(True) for part in parts]
         end = 1 + len(memory)
         with torch.enable_grad(), self._plain_layers():
@@ -278,9 +278,9 @@ class TorchPolicy(AbstractPolicy):
 
                 def evaluate(count: int) -> torch.Tensor:
                     hidden = (torch.cat([part] * count, axis) for part, axis in parts)
-                    told = None if one is None else one.expand(count, -1)
+                    rows = None if one is None else one.expand(count, -1)
                     several = goals.expand(count)
-                    return self._evaluate(pair[:count], several, tuple(hidden), told)[0]
+                    return self._evaluate(pair[:count], several, tuple(hidden), rows)[0]
 
                 scale = self.action.scale
                 largest = max(map(abs, scale if isinstance(scale, tuple) else (scale,)))
@@ -325,7 +325,7 @@ class TorchPolicy(AbstractPolicy):
         # Controls
         speed = None
         if self.action.needs_speed:
-            speed = self.inputs.told(numbers)["speed"][:, 0]
+            speed = self.inputs.by_name(numbers)["speed"][:, 0]
         control = self.action.controls(outputs[0], len(image), speed, self.name)
         after = outputs[1:]
         shapes = [tuple(part.shape) for part in after]

@@ -16,7 +16,6 @@ from mi_nerfattack.vehicle.route.route import Route
 #: In the order of documents and plots; others follow, by name.
 ENVIRONMENTS = (
     "surrogate",
-    "deployment",
     "mitsuba",
     "mujoco",
     "mujoco_gl",

@@ -21,8 +21,8 @@ from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.scenario.named_file import FileOrFolder
 from mi_nerfattack.scenario.section import UNTAGGED, Kinds, Section
 
-#: What the environment of attacks is called, and the deployment without a name.
-SURROGATE, DEPLOYMENT = "surrogate", "deployment"
+#: Name of the environment of attacks.
+SURROGATE = "surrogate"
 #: What was built in last of a field, by its content: seconds each, and the same in all
 #: environments and conditions.
 _BUILT: WeakKeyDictionary[GridField, dict[str, BuiltInObject]] = WeakKeyDictionary()
@@ -34,7 +34,7 @@ Objects = Literal["pasted", "built-in"]
 
 
 class AbstractDeploymentSection(Section):
-    """What all have: a name, under which results stand."""
+    """What all have: a name, under which results stand; by default the kind."""
 
     name: Label | None = None
 
@@ -105,15 +105,9 @@ DeploymentSections = Annotated[
 
 
 def labelled(given: DeploymentSections) -> list[tuple[str, DeploymentSection]]:
-    """Return each section with its label.
-
-    A section without a name is called by its kind; "deployment" if it is alone.
-    """
+    """Return each section with its label: its name, or its kind if it has none."""
     sections = given if isinstance(given, tuple) else [given]
-    alone = len(sections) == 1
-    return [
-        (item.name or (DEPLOYMENT if alone else item.kind), item) for item in sections
-    ]
+    return [(item.name or item.kind, item) for item in sections]
 
 
 @dataclass(frozen=True, eq=False)

@@ -74,6 +74,22 @@ def upgraded(values: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def upgraded_environment(name: str, scenario: Mapping[str, Any]) -> str:
+    """Return the name of today of an environment in results of an older version.
+
+    An only environment without a name was "deployment" there, whatever its kind.
+
+    Args:
+        name: in the results.
+        scenario: the values of their scenario.
+    """
+    given = upgraded(scenario).get("deployment", {})
+    [section, *others] = given if isinstance(given, list) else [given]
+    if name != "deployment" or others:
+        return name
+    return section.get("name") or section.get("kind", "mitsuba")
+
+
 def _each(change: Callable[[Any], Any], value: Any, is_one: bool) -> Any:
     """Change a table, or each of an array of tables."""
     if is_one and isinstance(value, list):

@@ -51,7 +51,7 @@ def test_examples_are_short(script):
 def test_tables_user(tmp_path):
     *means, worst = printed("tables_user", tmp_path)
     page = (DOCS / "table2" / "README.md").read_text("utf-8")
-    _, _, page = page.partition("## Deployment")
+    _, _, page = page.partition("## mitsuba")
     header = next(x for x in page.splitlines() if x.startswith("| route |"))
     column = [name.strip() for name in header.split("|")].index("attack")
     for route, mean in zip(("straight", "right", "left"), means, strict=True):
@@ -133,7 +133,7 @@ def test_the_xml_shows_both_fields(monkeypatch):
 def test_attacks_beat_every_random_texture_on_average():
     """At each place, in deployment; only on the left turn a wheel is out for 1 s."""
     table = read_table(ROOT / "docs/table2/results.csv")
-    driven = table[table["environment"] == "deployment"]
+    driven = table[table["environment"] == "mitsuba"]
     cases = driven.groupby(["route", "seed", "case"])
     means = cases["cross_track_mean_m"].mean().unstack("case")
     worst = cases["cross_track_mean_m"].max().unstack("case")

@@ -118,7 +118,7 @@ def test_the_chart_has_a_mark_for_each_drive():
     assert [line.get_ydata()[0] for line in axis.lines][0] == diagrams.LIMIT_M
     for marks, case in zip(axis.collections, diagrams.CASES, strict=True):
         x, y = np.array(marks.get_offsets()).T
-        own = (table["environment"] == "deployment") & (table["case"] == case)
+        own = (table["environment"] == "mitsuba") & (table["case"] == case)
         assert y.tolist() == table.loc[own, "cross_track_mean_m"].tolist()
         assert len(y) >= 30
         assert set(x.astype(int)) == set(range(15))

@@ -59,10 +59,10 @@ def test_departure_begins_beyond_the_limit():
 
 
 def test_environments_of_your_own_come_after_ours():
-    names = ("zoo", "mine", "deployment", "surrogate")
+    names = ("zoo", "mine", "mitsuba", "surrogate")
     drives = [make_drive([0.1], environment=name) for name in names]
     found = metrics.summarise(drives, LANES)["straight"]
-    assert list(found) == ["surrogate", "deployment", "mine", "zoo"]
+    assert list(found) == ["surrogate", "mitsuba", "mine", "zoo"]
 
 
 def test_sums_by_hand():
@@ -171,7 +171,7 @@ def test_document_follows_the_schema():
     named = document["schema"], document["seed"], document["scenario"]
     assert named == (2, 7, {"name": "x"}) and document["cost"] == COST
     assert list(document["routes"]["straight"]["surrogate"]) == ["own", "random"]
-    case = document["routes"]["straight"]["deployment"]["attack"]
+    case = document["routes"]["straight"]["mitsuba"]["attack"]
     assert (case["n"], case["steps_departed"]) == (1, 2)
 
 

@@ -100,7 +100,7 @@ def assert_counts(document):
     assert baseline["backward_multiple"] == pytest.approx(multiple)
     assert count == round(3 * (1 + multiple)) == len(baseline["objectives"])
     assert few == min(count, 8)
-    for environment, drawn in (("surrogate", count), ("deployment", few)):
+    for environment, drawn in (("surrogate", count), ("mitsuba", few)):
         counts = {case: drawn if case == "random" else 2 for case in CASES}
         assert {k: v["n"] for k, v in route[environment].items()} == counts
     rows = [(run["seed"], run["steps"]) for run in route["surrogate"]["own"]["per_run"]]
@@ -190,7 +190,7 @@ def test_the_demo_beats_random_textures_and_transfers(tmp_path):
     assert document == files.read_json(output / "metrics.json")
     harmless = ("not converged", "texture at its bounds")  # it has few iterations
     assert [f for f in document["flags"] if not f.startswith(harmless)] == []
-    for environment, least in (("surrogate", 3.0), ("deployment", 2.0)):
+    for environment, least in (("surrogate", 3.0), ("mitsuba", 2.0)):
         cases = document["routes"]["right"][environment]
         attack, random = (
             cases[case]["cross_track_mean_m"] for case in ("attack", "random")

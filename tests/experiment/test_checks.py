@@ -199,9 +199,9 @@ def test_two_worlds_of_other_scale():
         depth = along * np.sqrt(1 + u**2 + v[:, None] ** 2)
         frames.append(CameraFrame(np.zeros((20, 40, 3), np.uint8), depth, pose))
     one, near, far = frames
-    assert not list(likeness_findings(camera, near, one, "deployment"))
-    (line,) = likeness_findings(camera, far, one, "deployment")
-    assert "surrogate and deployment do not show one place" in line
+    assert not list(likeness_findings(camera, near, one, "mitsuba"))
+    (line,) = likeness_findings(camera, far, one, "mitsuba")
+    assert "surrogate and mitsuba do not show one place" in line
     assert "30 % or more" in line
 
 
@@ -223,7 +223,7 @@ def test_all_is_told_at_once_and_nothing_is_left(folder, tmp_path):
     starts = "ball is not in view", "stone stands on the lane", "ball is in the air"
     for line, start in zip(lines, starts, strict=True):
         assert line.startswith(f"  {start}")
-    assert stages == {"surrogate: own", "deployment: own"}
+    assert stages == {"surrogate: own", "mitsuba: own"}
     assert not contents(tmp_path) and not (tmp_path / "made").exists()
 
 
@@ -239,7 +239,7 @@ def test_what_drives_tell(folder, tmp_path):
     with pytest.raises(InputError) as refused:
         job(folder, tmp_path / "run", narrow).run()
     left, also, short, _ = str(refused.value).split("\n")[1:]
-    for line, place in ((left, "surrogate"), (also, "deployment")):
+    for line, place in ((left, "surrogate"), (also, "mitsuba")):
         assert f"in {place}, run 0" in line and "beyond 0.00 m after 0." in line
     for part in ("2 steps", "1.3 m", "'short' of 2.7 m", "0.2 s", "drive.horizon to 1"):
         assert part in short
@@ -248,7 +248,7 @@ def test_what_drives_tell(folder, tmp_path):
     far, seen = ("[drive]", "[drive]\nlateral_sd_m = 1.5"), []
     with pytest.raises(InputError, match="in surrogate, run 1, "):
         job(folder, tmp_path / "run", far, lambda *line: seen.append(line[0])).run()
-    assert set(seen) == {"surrogate: own", "deployment: own"}
+    assert set(seen) == {"surrogate: own", "mitsuba: own"}
     assert not contents(tmp_path)
 
 

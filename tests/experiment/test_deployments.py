@@ -316,8 +316,8 @@ def test_a_verdict_says_that_an_attack_removed_the_braking(tmp_path):
     lane, _, attack, transfer, *_ = document["verdict"]
     assert "0 of 2 drives in surrogate" in lane and "to spare" in lane
     assert attack.startswith("The attack beats random textures in the surrogate")
-    assert transfer.startswith("It transfers to deployment")
-    for sentence, environment in ((attack, "surrogate"), (transfer, "deployment")):
+    assert transfer.startswith("It transfers to mitsuba")
+    for sentence, environment in ((attack, "surrogate"), (transfer, "mitsuba")):
         cases = document["routes"]["line"][environment]
         values = (f"{cases[case]['objective']:.2f}" for case in ("attack", "own"))
         assert all(value in sentence for value in values), sentence
@@ -342,7 +342,7 @@ def test_an_objective_of_other_rows_has_no_value(tmp_path, monkeypatch):
     (folder / "rail.py").write_text(BRAKE)
     scenario, _ = load_scenario(folder / "scenario.toml")
     world = build_world(scenario, TorchPolicy(toy.SmoothPolicy()))
-    rows = {"surrogate": 4, "deployment": 6}
+    rows = {"surrogate": 4, "mujoco": 6}
     times = np.arange(1, 9) / 10
     drives = [
         Drive(name, "line", "own", 0, 1, np.ones((9, m)), times, times, times)
@@ -353,8 +353,8 @@ def test_an_objective_of_other_rows_has_no_value(tmp_path, monkeypatch):
     made = [*drives, short, old]
     done = Finished(world, made, build_attack(world), {}, [], {}, [])
     assert list(done.costs.values()) == [-8.0, None, None, None]
-    assert set(done.uncosted) == {"deployment", "surrogate"}
-    assert "4 rows" in done.uncosted["deployment"]
+    assert set(done.uncosted) == {"mujoco", "surrogate"}
+    assert "4 rows" in done.uncosted["mujoco"]
     assert "ended before" in done.uncosted["surrogate"]
     done = Finished(world, [old], build_attack(world), {}, [], {}, [])
     assert "older version recorded 3" in done.uncosted["surrogate"]

@@ -42,7 +42,7 @@ HORIZON = 5
 LONGER = "horizon = 2", f"horizon = {HORIZON}"
 #: How far a colour in half precision is from what was rounded, relative to 1.
 HALF = 2.0**-11
-LABELS = "surrogate", "deployment"
+LABELS = "surrogate", "mitsuba"
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,7 @@ def test_layers_add_up_in_half_precision(run, case):
         seen = files.read_image(folder / "0002.png")
         assert np.abs(shown.astype(int) - seen).max() <= 1
         assert ("object" in layers) == ("object" in parts)
-        if environment == "deployment" and case == "no_object":
+        if environment == "mitsuba" and case == "no_object":
             assert "scene" not in layers  # nothing to take apart
             continue
         half = environment == "surrogate"

@@ -140,7 +140,7 @@ def test_best_random_is_the_look_of_least_objective(whole):
     assert len(found) == 2 and found[0] != found[1]
     best = int(np.argmin(found))
     # of two looks and two starts: look k drives from start k
-    for label in ("surrogate", "deployment"):
+    for label in ("surrogate", "mitsuba"):
         one, other = (drives[label, case, best] for case in ("random", "best_random"))
         assert np.array_equal(one.states, other.states)
 

@@ -117,7 +117,7 @@ def test_functions_get_what_they_name(rng):
         assert seen["step"] == step and seen["front"].shape == (1, 3, 4, 6)
     np.testing.assert_array_equal(seen["route"].ravel(), numbers[0, 1:5])
     assert float(control[0]) == numbers[0, 2]
-    with pytest.raises(InputError, match="it is told speed, route, time, 6 numbers"):
+    with pytest.raises(InputError, match="it asks for speed, route, time, 6 numbers"):
         policy.step(frame, 0, memory)
 
 

@@ -166,7 +166,7 @@ def test_an_attack_on_a_policy_of_two_cameras(tmp_path):
     few = ["drive.runs=1", "baseline.deployment_textures=1"]
     command += ["--workers", "1", *(word for key in few for word in ("--set", key))]
     assert cli.main(command) == 0
-    for label in ("surrogate", "deployment"):
+    for label in ("surrogate", "mitsuba"):
         frames = run / "frames" / f"{label}_attack"
         image = files.read_image(frames / "0000.png")
         assert image.shape == (12, 40, 3) and not image[10:, :24].any()

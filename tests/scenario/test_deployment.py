@@ -38,12 +38,12 @@ def load(tmp_path):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("", ["deployment"]),
-        (f"{TABLE}spp = 4\n", ["deployment"]),
-        (f"{TABLES}spp = 4\n", ["deployment"]),
+        ("", ["mitsuba"]),
+        (f"{TABLE}spp = 4\n", ["mitsuba"]),
+        (f"{TABLES}spp = 4\n", ["mitsuba"]),
         (f'{TABLE}name = "lit"\n', ["lit"]),
         (f'{TABLES}{TABLES}name = "dusk"\n', ["mitsuba", "dusk"]),
-        (f'{TABLE}kind = "mujoco_gl"\n', ["deployment"]),
+        (f'{TABLE}kind = "mujoco_gl"\n', ["mujoco_gl"]),
     ],
 )
 def test_environments_are_called_by_name(load, tmp_path, text, expected):
@@ -61,8 +61,8 @@ def test_conditions_are_those_of_the_table(load):
     keys = "\n".join(f"{name} = {value!r}" for name, value in given.items())
     for kind, more in (('"mitsuba"\nspp = 4', {"spp": 4}), ('"mujoco_gl"', {})):
         section = load(f"{TABLE}kind = {kind}\n{keys}\n")[0].deployment
-        found = deployments(section, bundled_place())["deployment"].conditions
-        assert found == Conditions(**given, **more)
+        (found,) = deployments(section, bundled_place()).values()
+        assert found.conditions == Conditions(**given, **more)
 
 
 def test_the_car_with_wheels_is_the_vehicles_size(load):

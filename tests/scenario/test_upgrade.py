@@ -9,7 +9,11 @@ from mi_nerfattack import cli
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io.strict import parse_toml
 from mi_nerfattack.scenario.scenario import load_scenario
-from mi_nerfattack.scenario.upgrade import upgraded, upgraded_text
+from mi_nerfattack.scenario.upgrade import (
+    upgraded,
+    upgraded_environment,
+    upgraded_text,
+)
 
 OLD = """\
 # a scenario
@@ -161,3 +165,20 @@ def test_the_reader_names_the_command_which_does_it(tmp_path, capsys):
     assert cli.main(["upgrade", str(path)]) == 0
     assert "is of the form of today" in capsys.readouterr().out
     assert path.read_text() == text
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("deployment", "", "mitsuba"),
+        ("deployment", '[[deployment]]\nenvironment = "mujoco"', "mujoco"),
+        ("deployment", '[deployment]\nkind = "mujoco_gl"', "mujoco_gl"),
+        ("deployment", '[deployment]\nname = "deployment"', "deployment"),
+        ("deployment", '[[deployment]]\n[[deployment]]\nname = "deployment"', ""),
+        ("surrogate", "", ""),
+        ("lit", '[deployment]\nname = "lit"', ""),
+    ],
+)
+def test_an_only_environment_was_once_called_deployment(name, text, expected):
+    found = upgraded_environment(name, parse_toml("old.toml", text))
+    assert found == (expected or name)

@@ -117,7 +117,7 @@ def policy_control(policy: AbstractPolicy, goal: int) -> Callable[[np.ndarray], 
 
     if policy.numbers:
         raise InputError(
-            f"policy: it is told {', '.join(policy.numbers.columns)}, which the car "
+            f"policy: it asks for {', '.join(policy.numbers.columns)}, which the car "
             "does not measure; drive it in simulation, or give a policy of images"
         )
     memory = policy.initial_memory(1)

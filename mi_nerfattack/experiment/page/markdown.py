@@ -44,16 +44,12 @@ from mi_nerfattack.experiment.transfer.figures import (
 from mi_nerfattack.io import files
 from mi_nerfattack.report.pages.sections import markdown_table
 from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT, RANDOM
-from mi_nerfattack.scenario.deployment import DEPLOYMENT, SURROGATE
+from mi_nerfattack.scenario.deployment import SURROGATE
 
 #: Lines of a page between which the figures are; what is around them stays.
 BEGIN, END = "<!-- figures, by mi-nerfattack report -->", "<!-- end of the figures -->"
 #: Table of a transfer's drives, of which its page can be written again.
 DRIVES = "drives.csv"
-TITLES = {
-    DEPLOYMENT: "Deployment: the path-traced scene, objects pasted",
-    SURROGATE: "Surrogate: the fitted fields",
-}
 CASES = {
     NO_OBJECT: "without objects",
     RANDOM: "random textures",
@@ -159,9 +155,9 @@ def sections(summary: Figures, made: Figures) -> Iterator[str]:
     compared = len(methods_of(summary)) > 1
     header = ["route", "method", "frames", *CASES.values(), "attack to random"]
     header += ["to the gradient"] if compared else []
-    for environment, title in TITLES.items():
-        if rows := list(_rows(summary, environment, compared)):
-            yield f"## {title}\n\n{markdown_table(header, rows)}"
+    for environment in dict.fromkeys(g["environment"] for g in summary["groups"]):
+        rows = list(_rows(summary, environment, compared))
+        yield f"## {environment}\n\n{markdown_table(header, rows)}"
     yield _provenance(summary, made)
 
 

@@ -20,7 +20,7 @@ from mi_nerfattack.deploy.environment import (
     AbstractEnvironment,
     CameraFrame,
     policy_image,
-    told,
+    policy_numbers,
 )
 from mi_nerfattack.deploy.surrogate.environment import SurrogateEnvironment
 from mi_nerfattack.evaluation.metrics import environment_order
@@ -260,7 +260,7 @@ class Film:
             shown = frame if step in wanted else None
             yield Moment(step, self.environment.state, memory, shown)
             if watched:
-                numbers = told(policy, self.environment, route, step)
+                numbers = policy_numbers(policy, self.environment, route, step)
                 image = policy_image(frame.image)
                 _, memory = policy.step(image, route.goal, memory, numbers)
 

@@ -9,7 +9,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from mi_nerfattack.deploy.environment import policy_image, single_control, told
+from mi_nerfattack.deploy.environment import (
+    policy_image,
+    policy_numbers,
+    single_control,
+)
 from mi_nerfattack.deploy.place import Place
 from mi_nerfattack.deploy.sites import AbstractSite
 from mi_nerfattack.deploy.vehicle import Controls
@@ -247,7 +251,7 @@ class SectionDrives(AbstractSource):
 
         def control(image: np.ndarray) -> Controls:
             nonlocal memory, step
-            numbers = told(prepared, environment, route, step)
+            numbers = policy_numbers(prepared, environment, route, step)
             seen, step = policy_image(image), step + 1
             row, memory = prepared.step(seen, route.goal, memory, numbers)
             return single_control(row, environment.control_names)

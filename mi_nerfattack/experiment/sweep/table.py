@@ -21,7 +21,9 @@ from mi_nerfattack.evaluation.metrics import cells
 from mi_nerfattack.experiment.run_folder import METRICS
 from mi_nerfattack.experiment.sweep.cell import Cell, folder_of
 from mi_nerfattack.io import files
+from mi_nerfattack.io.strict import parse_toml
 from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, RANDOM
+from mi_nerfattack.scenario.upgrade import upgraded_environment
 
 #: The table, and what its cells were made of.
 RESULTS, MADE_OF = "results.csv", "cells.json"
@@ -63,11 +65,12 @@ def complete_rows(cell: Cell, sweep: Path) -> list[Row]:
         InputError: a file of the cell's folder is missing or damaged.
     """
     document = files.read_json(folder_of(sweep, cell) / METRICS)
-    frames = _frames(document)
+    frames, scenario = _frames(document), document["scenario"]
     return [
         {
             **labels_of(cell),
-            **{name: case[name] for name in ("environment", "case")},
+            "environment": upgraded_environment(case["environment"], scenario),
+            "case": case["case"],
             "frames": frames.get(case["case"], 0),
             **{name: drive[name] for name in _COPIED},
             "departed": drive["steps_departed"] > 0,
@@ -108,6 +111,8 @@ def write_table(folder: Path, rows: Iterable[Row], cells: Mapping[str, Any]) -> 
 def read_table(path: Path) -> pd.DataFrame:
     """Read a table, with `cross_track_total`: mean error times steps.
 
+    Environments of a table of an older version get their names of today.
+
     Raises:
         InputError: there is none, or it is damaged, too large, or not a sweep's table.
     """
@@ -119,6 +124,12 @@ def read_table(path: Path) -> pd.DataFrame:
             f"{path}: damaged: a drive has no figures; give the sweep's command again, "
             "which makes the table again"
         )
+    old = table.loc[table["environment"] == "deployment", "cell"]
+    made = read_made(path.parent) if len(old) else {}
+    for cell, rows in old.groupby(old):
+        scenario = parse_toml(cell, made[cell]["scenario"])
+        name = upgraded_environment("deployment", scenario)
+        table.loc[rows.index, "environment"] = name
     return with_total(table)
 
 

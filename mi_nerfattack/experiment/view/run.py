@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from mi_nerfattack.render.camera.intrinsics import mount_matrix
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT, Drive
 from mi_nerfattack.scenario.deployment import SURROGATE
+from mi_nerfattack.scenario.upgrade import upgraded_environment
 from mi_nerfattack.scenario.world import Appearance, World, build_world
 
 
@@ -93,7 +94,11 @@ def read_viewed(folder: Path) -> ViewedRun:
             that its scenario names is missing or has changed.
     """
     (found,) = read_found([folder])
-    drives = tuple(read_drives(folder / DRIVES))
+    values = found.scenario.model_dump(mode="json")
+    drives = tuple(
+        replace(drive, environment=upgraded_environment(drive.environment, values))
+        for drive in read_drives(folder / DRIVES)
+    )
     if not drives:
         raise InputError(
             f"{folder / DRIVES}: no drives; they were removed, attack anew"

@@ -47,6 +47,6 @@ class HttpPolicy(AbstractBlackBox):
         self, given: Mapping[str, np.ndarray], goals: np.ndarray, step: int
     ) -> np.ndarray:
         """Ask the server."""
-        told = [given[name].reshape(len(goals), -1) for name in self.sent]
-        numbers = np.hstack(told) if told else None
+        columns = [given[name].reshape(len(goals), -1) for name in self.sent]
+        numbers = np.hstack(columns) if columns else None
         return self.client.ask(given[IMAGE], goals.tolist(), step, numbers)

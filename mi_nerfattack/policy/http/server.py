@@ -131,8 +131,8 @@ class PolicyServer(HttpServer):
                 return last.controls
             before = self._memory(client, len(images), step)
             try:
-                told = None if numbers is None else mi.TensorXf(numbers)
-                row, after = self._policy.step(mi.TensorXf(images), goals, before, told)
+                rows = None if numbers is None else mi.TensorXf(numbers)
+                row, after = self._policy.step(mi.TensorXf(images), goals, before, rows)
                 controls = np.array(row, np.float64).T
             except InputError as err:
                 raise RefusedError(422, str(err)) from err
@@ -206,8 +206,8 @@ class _Handler(BaseHTTPRequestHandler):
             numbers = self._numbers(len(images), server.numbers.size)
             client = str(self.headers.get("X-Client", ""))[:64]
             # of the bytes that came: fewer than those of the images that they become
-            told = str(self.headers.get("X-Numbers", ""))
-            request = hashlib.blake2b(body + f"{goals} {told}".encode()).digest()
+            header = str(self.headers.get("X-Numbers", ""))
+            request = hashlib.blake2b(body + f"{goals} {header}".encode()).digest()
             controls = server.decide(client, request, images, goals, step, numbers)
             answer = {"control": controls}
         except RefusedError as refusal:

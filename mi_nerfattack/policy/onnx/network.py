@@ -235,8 +235,8 @@ class OnnxNetwork(torch.nn.Module):
             wrong = any(size not in (None, actual) for size, actual in pairs)
             if wrong or len(item.sizes) != value.ndim:
                 if item is self.inputs[0]:
-                    told = misfit(item.sizes, value.shape)
-                    raise InputError(f"{self.name}: {told}")
+                    reason = misfit(item.sizes, value.shape)
+                    raise InputError(f"{self.name}: {reason}")
                 sizes = ["any" if size is None else size for size in item.sizes]
                 raise InputError(
                     f"{self.name}: input {item.name!r} has the shape {sizes}; it gets "

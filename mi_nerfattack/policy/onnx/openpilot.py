@@ -138,11 +138,11 @@ class Openpilot(torch.nn.Module):
         seen = [pictures[_IMAGES[item.name]] for item in self.vision.inputs]
         feature = _cut("features", self.features, self.vision, *seen)
         known = torch.cat([history, feature[:, None]], 1)
-        told = self._told(known[:, :: self.stride], speed)
-        plan = _cut("plan", self.plan, self.policy, *told)
+        inputs = self._policy_inputs(known[:, :: self.stride], speed)
+        plan = _cut("plan", self.plan, self.policy, *inputs)
         return _positions(plan, self.hypotheses), known[:, 1:]
 
-    def _told(
+    def _policy_inputs(
         self, features: torch.Tensor, speed: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
         """Return the policy's arguments in its order."""

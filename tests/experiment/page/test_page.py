@@ -171,7 +171,7 @@ def test_objectives_stand_in_the_line_of_a_run(tmp_path, page_of):
         make_run(tmp_path / name, pictures=False)
     path = tmp_path / "other" / "metrics.json"
     document = files.read_json(path)
-    document["objective"] = {"name": "rail.py:slow", "missing": {"deployment": "why"}}
+    document["objective"] = {"name": "rail.py:slow", "missing": {"mitsuba": "why"}}
     for environment, cases in document["routes"]["straight"].items():
         for number, figures in enumerate(cases.values()):
             value = -1.5 * number if environment == "surrogate" else None
@@ -182,7 +182,7 @@ def test_objectives_stand_in_the_line_of_a_run(tmp_path, page_of):
     _, reader = page_of("one", "other")
     lines = [next(row for row in reader.rows if row[0] == k) for k in ("one", "other")]
     assert [line[-2:] for line in lines] == [["–", "–"], ["-1.5", "-4.5"]]
-    assert "It has no value in deployment: why." in reader.text
+    assert "It has no value in mitsuba: why." in reader.text
 
 
 def test_files_of_a_scenario_count_by_their_checksums():

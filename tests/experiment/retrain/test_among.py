@@ -50,7 +50,6 @@ CHANGES = {
     "horizon = 2": "horizon = 200",
     "[7.0, 4.2, 1.6]": "[-5.0, 2.6, 1.6]",
 }
-LABELS = {"surrogate": "surrogate", "mitsuba": "deployment"}
 SHIFT = np.array([0.5, 0.2, 0.0, 0.0, 0.0, 0.7])
 
 
@@ -119,7 +118,7 @@ def test_a_shard_shows_one_runs_objects_where_its_attack_left_them(found, tmp_pa
 def test_frames_are_those_of_the_attack(found):
     """A vehicle of the collection sees what it sees in a drive of the run."""
     place = found_place(found)
-    for name in LABELS:
+    for name in ("surrogate", "mitsuba"):
         site = PlaceSite(name, place, Weather(spp=1))
         taken = site.open(site.typical())
         for run in found:
@@ -129,7 +128,7 @@ def test_frames_are_those_of_the_attack(found):
             image = taken_image(taken, run, pose, attacked_objects(run))
             world = build_world(run.scenario, run.scenario.policy.build())
             world.show(run.looks(world)[ATTACK])
-            environment = world.open(LABELS[name])
+            environment = world.open(name)
             driven = environment.reset(run.route, pose, 3).image
             environment.close()
             assert np.abs(image.astype(int) - empty).max() > 20

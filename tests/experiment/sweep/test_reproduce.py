@@ -8,6 +8,7 @@ import signal
 import tempfile
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from support.faults.injected import signalled
 from support.pages.read import PageReader
@@ -101,6 +102,14 @@ def test_rows_come_back_to_the_bit(swept, command, tmp_path):
     assert code == 0 and "m, all equal\n" in out
 
 
+def test_environments_of_an_older_table_get_their_names_of_today(swept, tmp_path):
+    copy = shutil.copytree(swept[1], tmp_path / "copy")
+    path, today = copy / "results.csv", read_table(copy / "results.csv")
+    assert set(today["environment"].dropna()) == {"surrogate", "mitsuba"}
+    path.write_text(path.read_text().replace(",mitsuba,", ",deployment,"))
+    pd.testing.assert_frame_equal(read_table(path), today)
+
+
 def test_drives_alone_come_back(swept, command, tmp_path):
     folder, _, cell = swept
     out = tmp_path / "out"
@@ -132,7 +141,7 @@ def test_the_sweep_on_one_page(swept, tmp_path):
         group
         for group in summarise(table)["groups"]
         if group["route"]
-        and (group["environment"], group["case"]) == ("deployment", "attack")
+        and (group["environment"], group["case"]) == ("mitsuba", "attack")
     ]
     n, mean = str(attack["attacks"]), f"{attack['cross_track_mean_m']:.3f}"
     assert ["", "", "", "attack", n, mean, "–", "–"] in [r[:8] for r in reader.rows]

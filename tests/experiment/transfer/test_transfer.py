@@ -82,10 +82,8 @@ def kept_drive(run: Path, environment: str, case: str, number: int):
     return found
 
 
-@pytest.mark.parametrize(
-    ("environment", "label"), [("surrogate", "surrogate"), ("mitsuba", "deployment")]
-)
-def test_attacks_are_driven_unchanged(found_run, environment, label):
+@pytest.mark.parametrize("environment", ["surrogate", "mitsuba"])
+def test_attacks_are_driven_unchanged(found_run, environment):
     """From a start of the run, drives are the run's, bit by bit.
 
     Past the attack but for what files of objects round: they have half precision.
@@ -97,11 +95,11 @@ def test_attacks_are_driven_unchanged(found_run, environment, label):
     for case in CASES:
         world, identity = opened.world(0), {"case": case}
         batch = Batch(0, column, case, identity)
-        about = label, "line", case, 1, seed, world.horizon, identity
+        about = environment, "line", case, 1, seed, world.horizon, identity
         spec = DriveSpec(*about, how=(batch, world.initial[1]))
         with one_thread():
             result = opened.drive(spec, lambda step: None)
-        kept = kept_drive(found_run, label, case, 1)
+        kept = kept_drive(found_run, environment, case, 1)
         for name, array in result.arrays().items():
             atol = 5e-5 if case == "attack" else 0
             np.testing.assert_allclose(array, kept[name], 0, atol, err_msg=case)

@@ -32,12 +32,12 @@ def check_alone(page, *known):
 
 def test_a_file_opens_by_itself(found_run, tmp_path):
     path = tmp_path / "drive.html"
-    words = ["view", str(found_run), "-o", str(path), "--drive", "deployment: attack"]
+    words = ["view", str(found_run), "-o", str(path), "--drive", "mitsuba: attack"]
     assert cli.main(words) == 0
     with browser(tmp_path) as page:
         page.go(path.as_uri())
         page.wait(f"!!{SLIDER}")
-        assert page.ask("document.title") == "kill: deployment, attack"
+        assert page.ask("document.title") == "kill: mitsuba, attack"
         page.until(lambda: draws(page, tmp_path / "file.png"), "drawing")
         told = f"{SLIDER}.getAttribute('aria-valuemax')"
         assert float(page.ask(told)) == pytest.approx(0.3)  # two periods and the end

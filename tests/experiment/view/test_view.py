@@ -18,6 +18,7 @@ from support.faults.refusals import refused_at
 from mi_nerfattack import cli
 from mi_nerfattack.deploy.environment import CameraFrame
 from mi_nerfattack.deploy.views.above import PixelRays
+from mi_nerfattack.drives.store import read_drives
 from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.experiment.view import scene
 from mi_nerfattack.experiment.view import viewer as module
@@ -30,9 +31,15 @@ from mi_nerfattack.experiment.view.points import (
     scene_cloud,
     thinned,
 )
-from mi_nerfattack.experiment.view.run import offset_of, read_viewed, to_wxyz
+from mi_nerfattack.experiment.view.run import (
+    drive_name,
+    offset_of,
+    read_viewed,
+    to_wxyz,
+)
 from mi_nerfattack.experiment.view.scene import Contents, object_shapes
 from mi_nerfattack.experiment.view.viewer import Viewer, following
+from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov, mount_matrix
 from mi_nerfattack.render.camera.outside import seen_at
 from mi_nerfattack.render.camera.pose import Pose
@@ -121,7 +128,7 @@ def test_heat_is_brightest_from_half_on():
     assert found[0, 1].sum() > found[0, 0].sum()
 
 
-@pytest.mark.parametrize("label", ["surrogate", "deployment"])
+@pytest.mark.parametrize("label", ["surrogate", "mitsuba"])
 def test_frames_are_those_of_the_drive(viewed, label):
     """As its own environment gives them, driven there by the recorded controls."""
     drive, frames = viewed.drive(f"{label}: attack"), FrameSource(viewed)
@@ -144,6 +151,22 @@ def test_frames_are_those_of_the_drive(viewed, label):
     assert len(np.unique(apart.reshape(-1, 3), axis=0)) > 1
     assert frames.difference(viewed.drive(f"{label}: own"), 0, first, {}) is None
     frames.close()
+
+
+def test_environments_of_an_older_run_get_their_names_of_today(
+    found_run, viewed, tmp_path
+):
+    copy = shutil.copytree(found_run, tmp_path / "run")
+    (copy / "drives/mitsuba").rename(older := copy / "drives/deployment")
+    for path in older.iterdir():
+        tensors, about = files.read_safetensors(path)
+        about["kept.record"] = about["kept.record"].replace("mitsuba", "deployment")
+        files.write_safetensors(path, tensors, about)
+    assert [d.environment for d in read_drives(older.parent)].count("deployment") > 2
+    names, expected = (
+        [drive_name(d) for d in v.shown] for v in (read_viewed(copy), viewed)
+    )
+    assert names == expected
 
 
 def test_what_is_asked_for_is_rendered_once(viewer, viewed):
@@ -200,7 +223,7 @@ def test_an_environment_that_does_not_open_is_told(viewer, monkeypatch):
         raise InputError("no server listens")
 
     monkeypatch.setattr(type(viewer.viewed.world), "open", refuse)
-    viewer.choice.value = "deployment: attack"
+    viewer.choice.value = "mitsuba: attack"
     assert viewer.turn(0)
     assert "no server listens" in viewer.told.content
 

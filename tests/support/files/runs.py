@@ -32,7 +32,7 @@ def make_run(folder, attacked=1.2, frames=4, pictures=True, **changes):
         make_drive([0.1, -0.3, 0.2]),
         make_drive([0.5, 0.6, 0.7], run=1),
         make_drive([0.4, -attacked, 0.8], case="attack"),
-        make_drive([0.4, -attacked, 0.8], case="attack", environment="deployment"),
+        make_drive([0.4, -attacked, 0.8], case="attack", environment="mitsuba"),
     ]
     method = {"method": {"kind": "gradient"}, "freedom": {"kind": "texture"}}
     scenario = {"name": "a <ball>", "vehicle": {"dt_s": 0.1}, "attack": method}
@@ -125,7 +125,7 @@ def make_retraining(path):
 
 
 #: What `metrics.json` of a run folder holds.
-RUN_ENVIRONMENTS = ("surrogate", "deployment")
+RUN_ENVIRONMENTS = ("surrogate", "mitsuba")
 LANES = {"straight": Lane(0.85, 1.75)}
 COST = {"wall_s": 12.5, "peak_memory_mb": 900.0, "renders": 240}
 
@@ -150,7 +150,7 @@ def make_document(drives=None):
         make_drive([0.1, -0.3], case="own"),
         make_drive([0.1, -0.3, 0.2], run=0),
         make_drive([0.5, 0.9, 1.0], run=1),
-        make_drive([1.0, 1.2], case="attack", environment="deployment"),
+        make_drive([1.0, 1.2], case="attack", environment="mitsuba"),
     ]
     return metrics.metrics_document({"name": "x"}, 7, drives, LANES, COST)
 
