@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
-from matplotlib.axis import Axis
+from matplotlib.axis import Axis, XAxis
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
@@ -22,8 +22,8 @@ def draw_places(figure: Figure, errors: pd.DataFrame) -> None:
     axis = figure.subplots()
     colours = (GREY, *PALETTE)
     for number, case in enumerate(errors.columns):
-        style = {"color": colours[number], "label": case}
-        axis.plot(range(len(errors)), errors[case], _MARKS[number], **style)
+        (marks,) = axis.plot(range(len(errors)), errors[case], _MARKS[number])
+        marks.set(color=colours[number], label=case)
     axis.set_xticks(range(len(errors)), list(errors.index), rotation=45, ha="right")
     _make_logarithmic(axis.yaxis)
     axis.set_ylabel(DISTANCE)
@@ -80,7 +80,7 @@ def draw_heat(figure: Figure, ratios: pd.DataFrame) -> None:
 
 def _make_logarithmic(axis: Axis) -> None:
     """Give an axis powers of ten with labels at 1, 2 and 5 times each of them."""
-    axis.axes.set(**{f"{axis.axis_name}scale": "log"})
+    (axis.axes.set_xscale if isinstance(axis, XAxis) else axis.axes.set_yscale)("log")
     axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter(NullFormatter())

@@ -7,8 +7,9 @@ of their share lies above one half. A study with missing attacks claims nothing.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -21,8 +22,8 @@ from bench.studies.charts import (
     draw_searches,
     draw_shares,
 )
-from bench.studies.plan import State, Study, state
-from mi_nerfattack.drives.table import with_starts
+from bench.studies.plan import Study, state
+from mi_nerfattack.drives.table import records, with_starts
 from mi_nerfattack.evaluation.pairs import compare
 from mi_nerfattack.evaluation.summary import (
     Interval,
@@ -43,7 +44,7 @@ _CASES = {
     ATTACK: "attack",
 }
 _OF_SEARCHES = (
-    'attacks = drives[(drives.case == "attack") & (drives.environment == "surrogate")]\n'
+    "attacks = drives.query(\"case == 'attack' and environment == 'surrogate'\")\n"
     'print(attacks.groupby(["method", "route"]).cross_track_mean_m.mean().unstack())'
 )
 
@@ -71,52 +72,21 @@ class Finding:
     threats: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class Paired:
-    """Two sides compared at the same places and starts.
-
-    Attributes:
-        farther: places where the first side's mean error is larger.
-        places: in all, one per scenario and seed.
-        ratio: of the mean errors.
-        ratio_ci95: its interval, see `evaluation.summary.interval`.
-        one: mean error of the first side, metres.
-        other: of the second side.
-        difference: of the means, metres.
-        spread: standard deviation of the difference from seed to seed, metres.
-    """
-
-    farther: int
-    places: int
-    ratio: float
-    ratio_ci95: Interval
-    one: float
-    other: float
-    difference: float
-    spread: float | None
-
-    @property
-    def is_farther(self) -> bool:
-        """Whether the first side is farther at more than half of the places."""
-        ends = share_interval(self.farther, self.places)
-        return ends is not None and ends[0] > HALF
-
-
-def pair(one: pd.DataFrame, other: pd.DataFrame) -> Paired:
-    """Compare two sides of drives by place and start.
+def is_farther(one: pd.DataFrame, other: pd.DataFrame) -> tuple[int, bool]:
+    """Count the places where one side's mean error is larger than the other's.
 
     Args:
-        one: drives of one environment, case and method; see `evaluation.pairs.compare`.
-        other: as `one`, of the same places.
+        one: drives of one environment, case and method.
+        other: as `one`, at the same places.
+
+    Returns:
+        The number of places, and whether Wilson's interval of their share lies above
+        `HALF`.
     """
-    effect = compare(one, other, _ERROR)
-    means = [_by_place(side) for side in (one, other)]
-    farther = int((means[0] > means[1].reindex(means[0].index)).sum())
-    assert effect.ratio is not None  # a mean distance is positive
-    figures = effect.ratio, effect.ratio_ci95, effect.one, effect.other
-    return Paired(
-        farther, effect.attacks, *figures, effect.difference, effect.spread
-    )
+    means = _by_place(one)
+    count = int((means > _by_place(other).reindex(means.index)).sum())
+    ends = share_interval(count, len(means))
+    return count, ends is not None and ends[0] > HALF
 
 
 def finding(study: Study) -> Finding | None:
@@ -127,36 +97,43 @@ def finding(study: Study) -> Finding | None:
     if study.grid is not None:
         table = with_starts(table[table["status"] == "complete"], "cell")
         table["scenario"] = table["route"] + ", " + table["objects"]
-    return FINDINGS[study.finding](table, state(study, compare=False))
+    question, make = FINDINGS[study.finding]
+    made, one = make(table), state(study, compare=False)
+    if one.done == one.wanted:
+        return made
+    exist = f"{one.done} of {one.wanted} attacks exist"
+    return replace(made, title=f"Not yet known {question}: {exist}")
 
 
-def attack(drives: pd.DataFrame, one: State) -> Finding:
+def attack(drives: pd.DataFrame) -> Finding:
     """Compare the attack with the worst random texture of equal cost."""
     where = next(name for name in drives["environment"].unique() if name != SURROGATE)
     own = drives[drives["environment"] == where]
     by_case = {case: own[own["case"] == case] for case in _CASES}
-    found = pair(by_case[ATTACK], by_case[BEST_RANDOM])
-    places = f"{found.farther} of {found.places} places"
-    title = f"The attack moves the car farther than the worst random texture at {places}"
-    if one.done < one.wanted:
-        title = _unknown("whether the attack works", one)
-    elif not found.is_farther:
+    sides = by_case[ATTACK], by_case[BEST_RANDOM]
+    found, (count, is_shown) = compare(*sides, _ERROR), is_farther(*sides)
+    places = f"{count} of {found.attacks} places"
+    title = (
+        f"The attack moves the car farther than the worst random texture at {places}"
+    )
+    if not is_shown:
         title = f"The attack is not shown to be better than random textures: {places}"
     groups = summary(drives, ["environment", "case"], ["cell"])
     rows = [
         [
-            *(_CASES[row.case], row.environment, f"{row.cross_track_mean_m:.3f}"),
-            *(_ends(row.cross_track_mean_ci95_m), f"{row.attacks_out}/{row.attacks}"),
+            *(_CASES[row["case"]], row["environment"], f"{row[_ERROR]:.3f}"),
+            _ends(row["cross_track_mean_ci95_m"]),
+            f"{row['attacks_out']}/{row['attacks']}",
         ]
-        for row in groups.itertuples()
-        if row.case in _CASES
+        for row in records(groups)
+        if row["case"] in _CASES
     ]
     out = int(summary(by_case[ATTACK], ["case"], ["cell"])["attacks_out"].iloc[0])
     threats = []
     if found.ratio_ci95 is not None and found.ratio_ci95[0] <= 1:
         threats.append(
-            "The interval of the ratio of the means contains 1, because few attacks are "
-            "much stronger than the others. So the title counts places."
+            "The interval of the ratio of the means contains 1, because few attacks "
+            "are much stronger than the others. So the title counts places."
         )
     errors = pd.DataFrame({n: _by_place(by_case[case]) for case, n in _CASES.items()})
     errors.index = [f"{name.split(',')[0]} {seed}" for name, seed in errors.index]
@@ -167,11 +144,11 @@ def attack(drives: pd.DataFrame, one: State) -> Finding:
             f"from the lane centre on average, and the worst random texture "
             f"{found.other:.2f} m (ratio {found.ratio:.1f}, "
             f"{_interval(found.ratio_ci95, 1)}).",
-            f"The attack is farther at {places}, and a wheel leaves the lane for a second "
-            f"at {out} of them (share: "
-            f"{_interval(share_interval(out, found.places), 2)}).",
-            f"The mean difference is {found.difference:.2f} m, and its standard deviation "
-            f"from seed to seed is {_metres(found.spread)}.",
+            f"The attack is farther at {places}, and a wheel leaves the lane for a "
+            f"second at {out} of them (share: "
+            f"{_interval(share_interval(out, found.attacks), 2)}).",
+            f"The mean difference is {found.difference:.2f} m, and its standard "
+            f"deviation from seed to seed is {_metres(found.spread)}.",
         ),
         ["texture", "environment", "mean error (m)", "95 % interval", "attacks out"],
         rows,
@@ -182,36 +159,35 @@ def attack(drives: pd.DataFrame, one: State) -> Finding:
     )
 
 
-def gradient(drives: pd.DataFrame, one: State) -> Finding:
+def gradient(drives: pd.DataFrame) -> Finding:
     """Compare the gradient with each other search at an equal number of frames."""
     own = _attacks(drives)
     sides = {str(name): side for name, side in own.groupby("method", sort=False)}
     base = sides.pop(GRADIENT)
-    found = {name: pair(base, side) for name, side in sides.items()}
-    better = [name for name, paired in found.items() if paired.is_farther]
+    found = {name: compare(base, side, _ERROR) for name, side in sides.items()}
+    farther = {name: is_farther(base, side) for name, side in sides.items()}
+    better = [name for name, (_, is_shown) in farther.items() if is_shown]
     title = f"The gradient beats {len(better)} of {len(found)} other searches"
-    if one.done < one.wanted:
-        title = _unknown("whether the gradient is needed", one)
     means = own.groupby(["route", "method"], sort=False)[_ERROR].mean().unstack()
     above = means.drop(columns=GRADIENT).lt(means[GRADIENT], axis=0).to_numpy()
-    close, nearest = min(found.items(), key=lambda item: item[1].ratio)
+    close, nearest = min(found.items(), key=lambda item: item[1].ratio or 0.0)
     rows = [
         [
-            *(name, f"{sides[name]['frames'].mean():.0f}", f"{paired.other:.3f}"),
-            *(f"{paired.ratio:.2f}", _ends(paired.ratio_ci95, 2)),
-            *(f"{paired.farther}/{paired.places}", _metres(paired.spread)),
+            *(name, f"{sides[name]['frames'].mean():.0f}", f"{effect.other:.3f}"),
+            *(f"{effect.ratio:.2f}", _ends(effect.ratio_ci95, 2)),
+            *(f"{farther[name][0]}/{effect.attacks}", _metres(effect.spread)),
         ]
-        for name, paired in found.items()
+        for name, effect in found.items()
     ]
     return Finding(
         title,
         (
-            f"Over {nearest.places} places, the gradient moves the car "
+            f"Over {nearest.attacks} places, the gradient moves the car "
             f"{nearest.one:.2f} m from the lane centre on average in the surrogate.",
             f"The closest other search is `{close}`: the gradient moves the car "
             f"{nearest.ratio:.2f} times as far ({_interval(nearest.ratio_ci95, 2)}).",
-            f"The gradient has the larger mean in {above.sum()} of {above.size} pairs of "
-            "a search and a route.",
+            f"The gradient has the larger mean in {above.sum()} of {above.size} pairs "
+            "of a search and a route.",
         ),
         [
             *("search", "frames", "mean error (m)", "gradient to search"),
@@ -219,27 +195,25 @@ def gradient(drives: pd.DataFrame, one: State) -> Finding:
         ],
         rows,
         lambda figure: draw_ratios(
-            figure, {name: (p.ratio, p.ratio_ci95) for name, p in found.items()}
+            figure, {n: (e.ratio or 0.0, e.ratio_ci95) for n, e in found.items()}
         ),
         _OF_SEARCHES,
     )
 
 
-def searches(drives: pd.DataFrame, one: State) -> Finding:
+def searches(drives: pd.DataFrame) -> Finding:
     """Rank the searches by the geometric mean of their attacks over the routes."""
     own = _attacks(drives)
     errors = own.groupby(["method", "route"], sort=False)[_ERROR].mean().unstack()
-    rank = np.exp(np.log(errors).mean(axis=1)).sort_values(ascending=False)
-    title = f"Of {len(rank)} searches, `{rank.index[0]}` moves the car farthest"
-    lead = f"Its geometric mean over the routes is {rank.iloc[0]:.2f} m."
-    if one.done < one.wanted:
-        title = _unknown("which search by gradient is best", one)
-        lead = "The ranking needs an attack of each search on each route."
+    rank = errors.dropna().map(math.log).mean(axis=1).map(math.exp)
+    best = str(rank.idxmax())
+    title = f"Of {len(errors)} searches, `{best}` moves the car farthest"
     spread = own.groupby("cell")[_ERROR].std().mean()
     return Finding(
         title,
         (
-            lead,
+            f"Of the {len(rank)} searches with an attack on each of these routes, "
+            f"`{best}` has the largest geometric mean, {rank.max():.2f} m.",
             "There is one place per route, which is too few for an interval, so this "
             "table chooses a search and proves nothing.",
             "Between the starts of one attack, the error has a standard deviation of "
@@ -255,7 +229,7 @@ def searches(drives: pd.DataFrame, one: State) -> Finding:
     )
 
 
-def flat(drives: pd.DataFrame, one: State) -> Finding:
+def flat(drives: pd.DataFrame) -> Finding:
     """Count the drives that leave the lane, as bench/flat.toml says."""
     own = drives[drives["environment"] == "built_in"]
     groups = summary(own, ["case"], ["cell"]).set_index("case")
@@ -264,21 +238,19 @@ def flat(drives: pd.DataFrame, one: State) -> Finding:
     shares = {_CASES[case]: left[case] / count[case] for case in groups.index}
     percent = f"{100 * shares[_CASES[ATTACK]]:.0f} %"
     title = f"Flat objects send the car out of its lane in {percent} of the drives"
-    if one.done < one.wanted:
-        title = _unknown("whether flat objects mislead the policy", one)
     return Finding(
         title,
         (
-            f"With the attacked picture, {left[ATTACK]} of {count[ATTACK]} drives leave "
-            "the lane in the path-traced scene that lights the picture.",
+            f"With the attacked picture, {left[ATTACK]} of {count[ATTACK]} drives "
+            "leave the lane in the path-traced scene that lights the picture.",
             f"With random pictures, {left[RANDOM]} of {count[RANDOM]} drives leave it.",
-            "The aim that we set before the first result is 60 % of the drives with the "
-            "attack, and none with random pictures.",
+            "The aim that we set before the first result is 60 % of the drives with "
+            "the attack, and none with random pictures.",
         ),
         ["picture", "mean error (m)", "drives that leave the lane"],
         [
-            [_CASES[row.Index], f"{row.cross_track_mean_m:.3f}", f"{out}/{row.drives}"]
-            for row, out in zip(groups.itertuples(), left, strict=True)
+            [_CASES[case], f"{groups[_ERROR][case]:.3f}", f"{left[case]}/{count[case]}"]
+            for case in groups.index
         ],
         lambda figure: draw_shares(figure, shares),
         'lit = drives[drives.environment == "built_in"]\n'
@@ -286,12 +258,12 @@ def flat(drives: pd.DataFrame, one: State) -> Finding:
     )
 
 
-def transfer(drives: pd.DataFrame, one: State) -> Finding:
+def transfer(drives: pd.DataFrame) -> Finding:
     """Compare each environment and condition with the surrogate by day."""
     own, columns = drives[drives["case"] == ATTACK], ["environment", "condition"]
     table = own.pivot_table(_ERROR, "attack", columns, sort=False)
-    logs = np.log(table.div(table[SURROGATE]["day"], axis=0))
-    heat = np.exp(logs.mean()).unstack(sort=False)
+    logs = table.div(table[SURROGATE]["day"], axis=0).map(math.log)
+    heat = logs.mean().map(math.exp).unstack(sort=False)
     by_day = heat["day"].drop(SURROGATE)
     ends = {
         name: np.exp(found).tolist()
@@ -304,33 +276,31 @@ def transfer(drives: pd.DataFrame, one: State) -> Finding:
         f"Attacks keep half of their error in {kept} of {len(by_day)} environments, "
         f"and lose it in {lost}"
     )
-    if one.done < one.wanted:
-        title = _unknown("whether attacks transfer", one)
     return Finding(
         title,
         (
-            f"By day, the error with the attack is {by_day.max():.2f} times the error in "
-            f"the surrogate in `{by_day.idxmax()}`, and {by_day.min():.2f} times in "
+            f"By day, the error with the attack is {by_day.max():.2f} times the error "
+            f"in the surrogate in `{by_day.idxmax()}`, and {by_day.min():.2f} times in "
             f"`{by_day.idxmin()}`.",
             f"The 95 % interval of this ratio lies above one half in {kept} of "
             f"{len(by_day)} environments, and below one half in {lost}.",
             f"These are geometric means over {len(table)} attacks, paired by attack.",
         ),
         ["environment, by day", "error to the surrogate's", "95 % interval"],
-        [[n, f"{x:.2f}", _ends(ends.get(n), 2)] for n, x in by_day.items()],
+        [[str(n), f"{x:.2f}", _ends(ends.get(n), 2)] for n, x in by_day.items()],
         lambda figure: draw_heat(figure, heat),
         'attacks = drives[drives.case == "attack"]\n'
         'print(attacks.pivot_table("cross_track_mean_m", "environment", "condition"))',
     )
 
 
-#: By the name of the page.
-FINDINGS: dict[str, Callable[[pd.DataFrame, State], Finding]] = {
-    "attack": attack,
-    "gradient": gradient,
-    "searches": searches,
-    "flat": flat,
-    "transfer": transfer,
+#: By the name of the page: what is not known while attacks are missing, and the rest.
+FINDINGS: dict[str, tuple[str, Callable[[pd.DataFrame], Finding]]] = {
+    "attack": ("whether the attack works", attack),
+    "gradient": ("whether the gradient is needed", gradient),
+    "searches": ("which search by gradient is best", searches),
+    "flat": ("whether flat objects mislead the policy", flat),
+    "transfer": ("whether attacks transfer", transfer),
 }
 
 
@@ -342,10 +312,6 @@ def _attacks(drives: pd.DataFrame) -> pd.DataFrame:
 def _by_place(drives: pd.DataFrame) -> pd.Series:
     """Return the mean error by scenario and seed, metres."""
     return drives.groupby(["scenario", "seed"], sort=False)[_ERROR].mean()
-
-
-def _unknown(question: str, one: State) -> str:
-    return f"Not yet known {question}: {one.done} of {one.wanted} attacks exist"
 
 
 def _ends(ends: Interval, digits: int = 3) -> str:

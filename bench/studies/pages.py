@@ -68,11 +68,11 @@ def page_text(study: Study, made: Finding, one: State, picture: str) -> str:
     threats += [*made.threats, *study.threats]
     about = (
         f"[`{data}`]({relpath(ROOT / data, FOLDER)}) has the rows. "
-        f"[`{Path(rule).name}`]({relpath(ROOT / rule, FOLDER)}) has the places, seeds and "
-        f"budgets. `make results ONLY={study.name}` makes the rows that are missing. "
+        f"[`{Path(rule).name}`]({relpath(ROOT / rule, FOLDER)}) has the places, seeds "
+        f"and budgets. `make results ONLY={study.name}` makes missing rows. "
         f"{study.note} [How to read this page](index.md)."
     )
-    code = f'import pandas as pd\ndrives = pd.read_csv("{data}")\n{made.pandas}'
+    code = f'import pandas as pd\n\ndrives = pd.read_csv("{data}")\n{made.pandas}'
     parts = [
         f"# {made.title}",
         MARK,
@@ -90,5 +90,10 @@ def page_text(study: Study, made: Finding, one: State, picture: str) -> str:
 
 def _wrapped(text: str, indent: str = "") -> str:
     """Break lines at 100 characters; links stay whole."""
-    style = {"break_long_words": False, "break_on_hyphens": False}
-    return textwrap.fill(text, 100, subsequent_indent=indent, **style)
+    return textwrap.fill(
+        text,
+        100,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )

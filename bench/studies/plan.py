@@ -52,10 +52,13 @@ class Study(Section):
     question: str
     table: str  # folder with the committed rows
     grid: str | None = None
+    take: bool = True  # committed rows; false if other studies need their run folders
     commands: tuple[str, ...] = ()  # instead of a grid
     keep: tuple[str, ...] = ()  # files of {work} that the table's folder gets
     rows: str = RESULTS  # table (.csv) in `table`, or a pattern of result files
-    unit: str = "cell"  # column of the table; each of its values, or a file, counts as one
+    unit: str = (
+        "cell"  # column of the table; each of its values, or a file, counts as one
+    )
     cells: Count | None = None  # how many units there will be; a grid says it itself
     core_hours: Positive  # of one unit
     basis: str  # how we know core_hours

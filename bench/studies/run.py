@@ -6,7 +6,6 @@ import json
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -94,7 +93,7 @@ class BenchResults:
             if item.file in study.inputs and not (ROOT / item.file).exists():
                 run_command(shlex.split(item.command))
         try:
-            for words in self._words(study, take):
+            for words in self._words(study, take and study.take):
                 run_command(words)
             return True
         except SystemExit:
