@@ -89,24 +89,26 @@ class BenchResults:
 
     def _do(self, study: Study, take: bool = True) -> bool:
         """Make the rows of a study that are missing; False if a command failed."""
-        for item in read_plan().inputs:
-            if item.file in study.inputs and not (ROOT / item.file).exists():
-                run_command(shlex.split(item.command))
         try:
-            for words in self._words(study, take and study.take):
-                run_command(words)
+            for item in read_plan().inputs:
+                if item.file in study.inputs and not (ROOT / item.file).exists():
+                    run_command(shlex.split(item.command))
+            try:
+                for words in self._words(study, take and study.take):
+                    run_command(words)
+            finally:  # also after Ctrl-C
+                if take:
+                    refresh(study)
+            if take and study.report is not None:
+                run_command(_split(study.report, study))
             return True
-        except SystemExit:
-            say(f"{study.name}: the command failed; give the same command again")
+        except (SystemExit, InputError) as err:
+            say(f"{study.name}: failed ({err}); give the same command again")
             return False
-        finally:
-            if take:
-                refresh(study)
 
     def _words(self, study: Study, take: bool) -> Iterator[Sequence[str]]:
         for line in study.commands:
-            words = shlex.split(line.replace("{work}", str(study.work)))
-            yield [name for word in words for name in _expanded(word)]
+            yield _split(line, study)
         if study.grid is not None:
             words = ["sweep", str(ROOT / study.grid), "-o", str(study.work)]
             if take and (study.folder / RESULTS).exists():
@@ -178,8 +180,6 @@ def refresh(study: Study) -> None:
         for name in names:
             raw = files.read_bytes(work / name, files.MAX_TENSOR_BYTES)
             files.write_bytes(study.folder / name, raw)
-    if study.report is not None:
-        run_command(shlex.split(study.report.replace("{work}", str(work))))
 
 
 def drawn_rows(table: pd.DataFrame, share: float, seed: int) -> list[str]:
@@ -239,12 +239,14 @@ def _listed(studies: Sequence[Study]) -> Result:
     head = ["study", "question", "done", "as today", "core-hours left", "of one unit"]
     rows = [_list_row(study, states[study.name]) for study in studies]
     hours = sum(one.hours_left for one in states.values())
-    text = f"{markdown(head, rows)}\n{number(hours)} core-hours left in all"
+    whole = sum(states[one.name].wanted * one.core_hours for one in studies)
+    left = f"{number(hours)} of {number(whole)} core-hours are left"
+    text = f"{markdown(head, rows)}\n{left}"
     document = {
         name: asdict(one) | {"sources": sorted(one.sources)}
         for name, one in states.items()
     }
-    return Result(document | {"hours_left": hours}, lambda: print(text))
+    return Result(document | {"hours_left": hours, "hours": whole}, lambda: print(text))
 
 
 def _list_row(study: Study, one: State) -> list[str]:
@@ -256,6 +258,12 @@ def _list_row(study: Study, one: State) -> list[str]:
 
 def _shown(value: float | None) -> str:
     return "none compared" if value is None else f"{value:g}"
+
+
+def _split(line: str, study: Study) -> list[str]:
+    """Return the words of a command of a study."""
+    words = shlex.split(line.replace("{work}", str(study.work)))
+    return [name for word in words for name in _expanded(word)]
 
 
 def _expanded(word: str) -> list[str]:

@@ -212,10 +212,16 @@ def test_a_run_takes_the_committed_rows_and_goes_on_after_a_failure(study, monke
     assert main(["results", "--workers", "1"]) == 1
     write(study.folder, table({"attack": [0.1]}))
     assert main(["results"]) == 1
+    reported = study.model_copy(update={"report": "report {work} -o page.md"})
+    monkeypatch.setattr(run, "choose", lambda names: [reported])
+    assert main(["results"]) == 1  # no report after a failure
+    monkeypatch.setattr(run, "run_command", calls.append)
+    assert main(["results"]) == 0
     sweep = ["sweep", study.grid, "-o", str(study.work)]
     assert calls == [
         [*sweep, "--workers", "1"],
-        [*sweep, "--take", str(study.folder)],
+        *3 * [[*sweep, "--take", str(study.folder)]],
+        ["report", str(study.work), "-o", "page.md"],
     ]
 
 
