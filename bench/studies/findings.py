@@ -85,8 +85,13 @@ def is_farther(one: pd.DataFrame, other: pd.DataFrame) -> tuple[int, bool]:
     """
     means = _by_place(one)
     count = int((means > _by_place(other).reindex(means.index)).sum())
-    ends = share_interval(count, len(means))
-    return count, ends is not None and ends[0] > HALF
+    return count, is_majority(count, len(means))
+
+
+def is_majority(count: int, places: int) -> bool:
+    """Whether Wilson's interval of a share of the places lies above `HALF`."""
+    ends = share_interval(count, places)
+    return ends is not None and ends[0] > HALF
 
 
 def finding(study: Study) -> Finding | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 
 import numpy as np
 import pandas as pd
@@ -12,7 +13,7 @@ from matplotlib.figure import Figure
 from bench.__main__ import main
 from bench.studies import plan, run
 from bench.studies.charts import draw_heat, draw_ratios
-from bench.studies.findings import FINDINGS, finding, is_farther
+from bench.studies.findings import FINDINGS, finding, is_farther, is_majority
 from bench.studies.pages import FOLDER, page_text
 from bench.studies.plan import ROOT, Study, read_plan, state, wanted_labels
 from mi_nerfattack import cli
@@ -103,6 +104,14 @@ def test_a_side_is_farther_if_wilsons_interval_lies_above_one_half():
     ):
         other = drives(table({"attack": [0.1] * len(errors)}))
         assert is_farther(drives(table({"attack": errors})), other) == wanted
+
+
+def test_equal_sides_are_seldom_farther_by_chance():
+    """By the binomial distribution, as docs/findings/index.md says: 4 % at most."""
+    for places in range(5, 41):
+        majorities = [k for k in range(places + 1) if is_majority(k, places)]
+        ways = sum(math.comb(places, k) for k in majorities)
+        assert 0 < ways / 2**places < 0.04
 
 
 def test_the_attack_is_compared_with_the_worst_random_texture():
