@@ -10,7 +10,7 @@ TORCH := torch==2.13.0
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-fast test-slow test-all test-fuzz test-random mutants lint docs dist bench-gpu check-python clean
+.PHONY: help demo test test-fast test-slow test-all test-fuzz test-random mutants lint docs dist results bench-gpu check-python clean
 
 help:
 	@echo "make demo         run the whole chain on the bundled scene, up to 11 minutes"
@@ -22,6 +22,7 @@ help:
 	@echo "make mutants      change the code 400 times and count what the tests notice, hours"
 	@echo "make lint         check format, lint and types"
 	@echo "make docs         build the documentation's site in build/docs"
+	@echo "make results      make the committed rows again; ONLY=table2, QUICK=1, CHECK=1, LIST=1"
 	@echo "make bench-gpu    measure on an NVIDIA GPU, within 10 minutes, into bench/results"
 	@echo "make dist         build wheel and sdist, and run the wheel in an empty environment"
 	@echo "make clean        remove the virtual environment and what was built"
@@ -64,6 +65,11 @@ docs: $(VENV)/.installed-dev
 # The wheel comes of the sdist, holds what one of the tree holds, and works by itself.
 dist: $(VENV)/.installed-dev
 	$(VENV)/bin/python .ci/dist.py "$(TORCH)"
+
+# Each run continues. All studies take days: see LIST=1, and bench/results.toml.
+results: $(VENV)/.installed-test
+	$(VENV)/bin/python -m bench results $(if $(ONLY),--only $(ONLY)) $(if $(LIST),--list) \
+	  $(if $(CHECK),--check) $(if $(QUICK),--quick)
 
 # Refused without a GPU. PyTorch must be a build for CUDA; ours above may not be one.
 bench-gpu: $(VENV)/.installed-test

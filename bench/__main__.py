@@ -13,6 +13,7 @@ from bench.loop.bench import BenchLoop
 from bench.render.bench import BenchRender
 from bench.roughness import BenchRoughness
 from bench.splats import BenchSplats
+from bench.studies.run import BenchResults
 from mi_nerfattack import cli
 
 COMMANDS = {
@@ -27,6 +28,7 @@ COMMANDS = {
     "gaps": BenchGaps,
     "frames": BenchFrames,
     "gpu": BenchGpu,
+    "results": BenchResults,
 }
 
 

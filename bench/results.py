@@ -173,13 +173,22 @@ def _cpu() -> str:
     return platform.processor() or platform.machine()
 
 
-def run_command(words: Sequence[str]) -> None:
-    """Run ``mi-nerfattack`` in a process of its own.
+def run_command(words: Sequence[str], capture: bool = False) -> str:
+    """Run ``mi-nerfattack``, or ``python -m bench``, in a process of its own.
+
+    Args:
+        words: of its command line; the first one is ``bench`` for a benchmark.
+        capture: return what it prints on standard output; without, return "".
 
     Raises:
         SystemExit: with its exit code, if it fails.
     """
-    print("$", shlex.join(["mi-nerfattack", *words]), flush=True)
-    command = [sys.executable, "-m", "mi_nerfattack.cli", *words]
-    if code := subprocess.run(command, check=False).returncode:
+    is_bench, own = words[0] == "bench", ["mi-nerfattack", *words]
+    print("$", shlex.join(words if is_bench else own), file=sys.stderr, flush=True)
+    module = list(words) if is_bench else ["mi_nerfattack.cli", *words]
+    command = [sys.executable, "-m", *module]
+    pipe = subprocess.PIPE if capture else None
+    done = subprocess.run(command, check=False, stdout=pipe, text=True)
+    if code := done.returncode:
         raise SystemExit(code if code > 0 else 1)
+    return done.stdout or ""

@@ -53,7 +53,7 @@ highlight_language = "none"
 
 
 # Pages whose lists of links are the table of contents.
-CONTENTS = ("index", "tutorials/index")
+CONTENTS = ("index", "tutorials/index", "findings/index")
 # The site shows these files as pages; in the repository a page links to each.
 CARDS = {
     "pilotnet": "../scenes/policy/pilotnet.md",

@@ -59,7 +59,8 @@ def do_cells(
             state = f"{len(sweep.complete)}/{len(cells)}, {sweep.steps} control periods"
             if sweep.errors:
                 state += f", {len(sweep.errors)} failed"
-            done = max(done, min(kept + sweep.steps, sum(planned)))
+            # A cell may take more periods than planned, and is not done before its end.
+            done = max(done, min(kept + sweep.steps, sum(planned) - 1))
             bars.show("cells", done, sum(planned), state, kept=done == kept)
 
         work = Cells(tuple(cells), folder.resolve(), cores)

@@ -1,0 +1,1 @@
+"""The studies of bench/results.toml: their state, their runs and their pages."""

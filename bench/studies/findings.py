@@ -1,0 +1,334 @@
+"""The findings of the studies, computed from their committed tables.
+
+A title follows the rules of docs/findings/index.md: one side is farther from the lane
+centre than another only if it is farther at so many places that Wilson's 95 % interval
+of their share lies above one half. A study with missing attacks claims nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from bench.studies.charts import (
+    draw_heat,
+    draw_places,
+    draw_ratios,
+    draw_searches,
+    draw_shares,
+)
+from bench.studies.plan import Study, state
+from mi_nerfattack.drives.table import records, with_starts
+from mi_nerfattack.evaluation.pairs import compare
+from mi_nerfattack.evaluation.summary import (
+    Interval,
+    interval,
+    share_interval,
+    summary,
+)
+from mi_nerfattack.experiment.sweep.summary import GRADIENT
+from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, NO_OBJECT, RANDOM
+from mi_nerfattack.scenario.deployment import SURROGATE
+
+HALF = 0.5  # of the error in the surrogate, and of the places
+_ERROR = "cross_track_mean_m"
+_CASES = {
+    NO_OBJECT: "no object",
+    RANDOM: "random textures",
+    BEST_RANDOM: "worst random texture",
+    ATTACK: "attack",
+}
+_OF_SEARCHES = (
+    "attacks = drives.query(\"case == 'attack' and environment == 'surrogate'\")\n"
+    'print(attacks.groupby(["method", "route"]).cross_track_mean_m.mean().unstack())'
+)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a page shows.
+
+    Attributes:
+        title: the finding, a sentence without its full stop.
+        sentences: three.
+        head: of the table.
+        rows: of the table.
+        draw: draws the chart in an empty figure.
+        pandas: the second and the third line that read the data.
+        threats: to validity, which depend on the rows.
+    """
+
+    title: str
+    sentences: tuple[str, str, str]
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    draw: Callable[[Figure], None]
+    pandas: str
+    threats: tuple[str, ...] = ()
+
+
+def is_farther(one: pd.DataFrame, other: pd.DataFrame) -> tuple[int, bool]:
+    """Count the places where one side's mean error is larger than the other's.
+
+    Args:
+        one: drives of one environment, case and method.
+        other: as `one`, at the same places.
+
+    Returns:
+        The number of places, and whether Wilson's interval of their share lies above
+        `HALF`.
+    """
+    means = _by_place(one)
+    count = int((means > _by_place(other).reindex(means.index)).sum())
+    return count, is_majority(count, len(means))
+
+
+def is_majority(count: int, places: int) -> bool:
+    """Whether Wilson's interval of a share of the places lies above `HALF`."""
+    ends = share_interval(count, places)
+    return ends is not None and ends[0] > HALF
+
+
+def finding(study: Study) -> Finding | None:
+    """Return the finding of a study; None if it has no page or no rows."""
+    table = study.read()
+    if study.finding is None or table is None:
+        return None
+    if study.grid is not None:
+        table = with_starts(table[table["status"] == "complete"], "cell")
+        table["scenario"] = table["route"] + ", " + table["objects"]
+    question, make = FINDINGS[study.finding]
+    made, one = make(table), state(study, compare=False)
+    if one.done == one.wanted:
+        return made
+    exist = f"{one.done} of {one.wanted} attacks exist"
+    return replace(made, title=f"Not yet known {question}: {exist}")
+
+
+def attack(drives: pd.DataFrame) -> Finding:
+    """Compare the attack with the worst random texture of equal cost."""
+    where = next(name for name in drives["environment"].unique() if name != SURROGATE)
+    own = drives[drives["environment"] == where]
+    by_case = {case: own[own["case"] == case] for case in _CASES}
+    sides = by_case[ATTACK], by_case[BEST_RANDOM]
+    found, (count, is_shown) = compare(*sides, _ERROR), is_farther(*sides)
+    places = f"{count} of {found.attacks} places"
+    title = (
+        f"The attack moves the car farther than the worst random texture at {places}"
+    )
+    if not is_shown:
+        title = f"The attack is not shown to be better than random textures: {places}"
+    groups = summary(drives, ["environment", "case"], ["cell"])
+    rows = [
+        [
+            *(_CASES[row["case"]], row["environment"], f"{row[_ERROR]:.3f}"),
+            _ends(row["cross_track_mean_ci95_m"]),
+            f"{row['attacks_out']}/{row['attacks']}",
+        ]
+        for row in records(groups)
+        if row["case"] in _CASES
+    ]
+    out = int(summary(by_case[ATTACK], ["case"], ["cell"])["attacks_out"].iloc[0])
+    threats = []
+    if found.ratio_ci95 is not None and found.ratio_ci95[0] <= 1:
+        threats.append(
+            "The interval of the ratio of the means contains 1, because few attacks "
+            "are much stronger than the others. So the title counts places."
+        )
+    errors = pd.DataFrame({n: _by_place(by_case[case]) for case, n in _CASES.items()})
+    errors.index = [f"{name.split(',')[0]} {seed}" for name, seed in errors.index]
+    return Finding(
+        title,
+        (
+            f"In the environment `{where}`, the attack moves the car {found.one:.2f} m "
+            f"from the lane centre on average, and the worst random texture "
+            f"{found.other:.2f} m (ratio {found.ratio:.1f}, "
+            f"{_interval(found.ratio_ci95, 1)}).",
+            f"The attack is farther at {places}, and a wheel leaves the lane for a "
+            f"second at {out} of them (share: "
+            f"{_interval(share_interval(out, found.attacks), 2)}).",
+            f"The mean difference is {found.difference:.2f} m, and its standard "
+            f"deviation from seed to seed is {_metres(found.spread)}.",
+        ),
+        ["texture", "environment", "mean error (m)", "95 % interval", "attacks out"],
+        rows,
+        lambda figure: draw_places(figure, errors),
+        f'deployed = drives[drives.environment == "{where}"]\n'
+        'print(deployed.groupby(["route", "case"]).cross_track_mean_m.mean())',
+        tuple(threats),
+    )
+
+
+def gradient(drives: pd.DataFrame) -> Finding:
+    """Compare the gradient with each other search at an equal number of frames."""
+    own = _attacks(drives)
+    sides = {str(name): side for name, side in own.groupby("method", sort=False)}
+    base = sides.pop(GRADIENT)
+    found = {name: compare(base, side, _ERROR) for name, side in sides.items()}
+    farther = {name: is_farther(base, side) for name, side in sides.items()}
+    better = [name for name, (_, is_shown) in farther.items() if is_shown]
+    title = f"The gradient beats {len(better)} of {len(found)} other searches"
+    means = own.groupby(["route", "method"], sort=False)[_ERROR].mean().unstack()
+    above = means.drop(columns=GRADIENT).lt(means[GRADIENT], axis=0).to_numpy()
+    close, nearest = min(found.items(), key=lambda item: item[1].ratio or 0.0)
+    rows = [
+        [
+            *(name, f"{sides[name]['frames'].mean():.0f}", f"{effect.other:.3f}"),
+            *(f"{effect.ratio:.2f}", _ends(effect.ratio_ci95, 2)),
+            *(f"{farther[name][0]}/{effect.attacks}", _metres(effect.spread)),
+        ]
+        for name, effect in found.items()
+    ]
+    return Finding(
+        title,
+        (
+            f"Over {nearest.attacks} places, the gradient moves the car "
+            f"{nearest.one:.2f} m from the lane centre on average in the surrogate.",
+            f"The closest other search is `{close}`: the gradient moves the car "
+            f"{nearest.ratio:.2f} times as far ({_interval(nearest.ratio_ci95, 2)}).",
+            f"The gradient has the larger mean in {above.sum()} of {above.size} pairs "
+            "of a search and a route.",
+        ),
+        [
+            *("search", "frames", "mean error (m)", "gradient to search"),
+            *("95 % interval", "gradient farther", "spread of the difference"),
+        ],
+        rows,
+        lambda figure: draw_ratios(
+            figure, {n: (e.ratio or 0.0, e.ratio_ci95) for n, e in found.items()}
+        ),
+        _OF_SEARCHES,
+    )
+
+
+def searches(drives: pd.DataFrame) -> Finding:
+    """Rank the searches by the geometric mean of their attacks over the routes."""
+    own = _attacks(drives)
+    errors = own.groupby(["method", "route"], sort=False)[_ERROR].mean().unstack()
+    rank = errors.dropna().map(math.log).mean(axis=1).map(math.exp)
+    best = str(rank.idxmax())
+    title = f"Of {len(errors)} searches, `{best}` moves the car farthest"
+    spread = own.groupby("cell")[_ERROR].std().mean()
+    return Finding(
+        title,
+        (
+            f"Of the {len(rank)} searches with an attack on each of these routes, "
+            f"`{best}` has the largest geometric mean, {rank.max():.2f} m.",
+            "There is one place per route, which is too few for an interval, so this "
+            "table chooses a search and proves nothing.",
+            "Between the starts of one attack, the error has a standard deviation of "
+            f"{spread:.3f} m on average.",
+        ),
+        ["search", *(f"{route} (m)" for route in errors.columns)],
+        [
+            [str(name), *("–" if pd.isna(x) else f"{x:.3f}" for x in line)]
+            for name, line in zip(errors.index, errors.to_numpy(), strict=True)
+        ],
+        lambda figure: draw_searches(figure, errors),
+        _OF_SEARCHES,
+    )
+
+
+def flat(drives: pd.DataFrame) -> Finding:
+    """Count the drives that leave the lane, as bench/flat.toml says."""
+    own = drives[drives["environment"] == "built_in"]
+    groups = summary(own, ["case"], ["cell"]).set_index("case")
+    groups = groups.loc[[case for case in _CASES if case in groups.index]]
+    left, count = groups["drives_departed"], groups["drives"]
+    shares = {_CASES[case]: left[case] / count[case] for case in groups.index}
+    percent = f"{100 * shares[_CASES[ATTACK]]:.0f} %"
+    title = f"Flat objects send the car out of its lane in {percent} of the drives"
+    return Finding(
+        title,
+        (
+            f"With the attacked picture, {left[ATTACK]} of {count[ATTACK]} drives "
+            "leave the lane in the path-traced scene that lights the picture.",
+            f"With random pictures, {left[RANDOM]} of {count[RANDOM]} drives leave it.",
+            "The aim that we set before the first result is 60 % of the drives with "
+            "the attack, and none with random pictures.",
+        ),
+        ["picture", "mean error (m)", "drives that leave the lane"],
+        [
+            [_CASES[case], f"{groups[_ERROR][case]:.3f}", f"{left[case]}/{count[case]}"]
+            for case in groups.index
+        ],
+        lambda figure: draw_shares(figure, shares),
+        'lit = drives[drives.environment == "built_in"]\n'
+        'print(lit.groupby(["objects", "case"]).departed.mean())',
+    )
+
+
+def transfer(drives: pd.DataFrame) -> Finding:
+    """Compare each environment and condition with the surrogate by day."""
+    own, columns = drives[drives["case"] == ATTACK], ["environment", "condition"]
+    table = own.pivot_table(_ERROR, "attack", columns, sort=False)
+    logs = table.div(table[SURROGATE]["day"], axis=0).map(math.log)
+    heat = logs.mean().map(math.exp).unstack(sort=False)
+    by_day = heat["day"].drop(SURROGATE)
+    ends = {
+        name: np.exp(found).tolist()
+        for name in by_day.index
+        if (found := interval(np.mean, (logs[name]["day"].to_numpy(),), 0)) is not None
+    }
+    kept = sum(low > HALF for low, _ in ends.values())
+    lost = sum(high < HALF for _, high in ends.values())
+    title = (
+        f"Attacks keep half of their error in {kept} of {len(by_day)} environments, "
+        f"and lose it in {lost}"
+    )
+    return Finding(
+        title,
+        (
+            f"By day, the error with the attack is {by_day.max():.2f} times the error "
+            f"in the surrogate in `{by_day.idxmax()}`, and {by_day.min():.2f} times in "
+            f"`{by_day.idxmin()}`.",
+            f"The 95 % interval of this ratio lies above one half in {kept} of "
+            f"{len(by_day)} environments, and below one half in {lost}.",
+            f"These are geometric means over {len(table)} attacks, paired by attack.",
+        ),
+        ["environment, by day", "error to the surrogate's", "95 % interval"],
+        [[str(n), f"{x:.2f}", _ends(ends.get(n), 2)] for n, x in by_day.items()],
+        lambda figure: draw_heat(figure, heat),
+        'attacks = drives[drives.case == "attack"]\n'
+        'print(attacks.pivot_table("cross_track_mean_m", "environment", "condition"))',
+    )
+
+
+#: By the name of the page: what is not known while attacks are missing, and the rest.
+FINDINGS: dict[str, tuple[str, Callable[[pd.DataFrame], Finding]]] = {
+    "attack": ("whether the attack works", attack),
+    "gradient": ("whether the gradient is needed", gradient),
+    "searches": ("which search by gradient is best", searches),
+    "flat": ("whether flat objects mislead the policy", flat),
+    "transfer": ("whether attacks transfer", transfer),
+}
+
+
+def _attacks(drives: pd.DataFrame) -> pd.DataFrame:
+    """Return the drives with the attack in the surrogate."""
+    return drives[(drives["environment"] == SURROGATE) & (drives["case"] == ATTACK)]
+
+
+def _by_place(drives: pd.DataFrame) -> pd.Series:
+    """Return the mean error by scenario and seed, metres."""
+    return drives.groupby(["scenario", "seed"], sort=False)[_ERROR].mean()
+
+
+def _ends(ends: Interval, digits: int = 3) -> str:
+    """Return an interval as a cell of a table."""
+    return "–" if ends is None else f"{ends[0]:.{digits}f} to {ends[1]:.{digits}f}"
+
+
+def _interval(ends: Interval, digits: int) -> str:
+    """Return an interval as words."""
+    few = "too few places for an interval"
+    return few if ends is None else f"95 % interval {_ends(ends, digits)}"
+
+
+def _metres(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.2f} m"

@@ -1,0 +1,99 @@
+"""Write the pages of docs/findings."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from os.path import relpath
+from pathlib import Path
+
+from bench.studies.findings import Finding, finding
+from bench.studies.plan import ROOT, UNKNOWN, State, Study, read_plan, state
+from bench.tables import markdown
+from mi_nerfattack.io import files
+from mi_nerfattack.report.plots.charts import blank, png
+
+MARK = "<!-- python -m bench results --pages writes this page from the table. -->"
+FOLDER = ROOT / "docs/findings"
+_SIZE_IN, _DPI = (8.0, 3.4), 100
+
+
+def write_pages(
+    studies: Sequence[Study] = (),
+    folder: Path = FOLDER,
+    pictures: Path = ROOT / "docs/pictures",
+) -> list[Path]:
+    """Write a page and a chart for each study that has rows and a finding.
+
+    Args:
+        studies: by default all of the plan.
+        folder: of the pages.
+        pictures: folder of the charts.
+
+    Returns:
+        Paths of the pages.
+    """
+    written = []
+    for study in studies or read_plan().studies:
+        if (made := finding(study)) is not None:
+            chart = files.make_folder(pictures) / f"finding_{study.finding}.png"
+            with blank(_SIZE_IN, _DPI) as figure:
+                made.draw(figure)
+                files.write_bytes(chart, png(figure))
+            page = files.make_folder(folder) / f"{study.finding}.md"
+            one = state(study, compare=False)
+            files.write_text(page, page_text(study, made, one, relpath(chart, folder)))
+            written.append(page)
+    return written
+
+
+def page_text(study: Study, made: Finding, one: State, picture: str) -> str:
+    """Return a page as Markdown.
+
+    Args:
+        study: whose page it is.
+        made: what it shows.
+        one: how far the study is.
+        picture: address of the chart.
+    """
+    data, rule = f"{study.table}/{study.rows}", study.grid or "bench/results.toml"
+    threats = [f"The table has {one.done} of {one.wanted} attacks."]
+    if UNKNOWN in one.sources:
+        threats.append(
+            "Nobody recorded which version of the source made these rows, so today's "
+            f"program may give other figures (`make results LIST=1 ONLY={study.name}`)."
+        )
+    if len(one.sources) > 1:
+        threats.append(f"{len(one.sources)} versions of the program made these rows.")
+    threats += [*made.threats, *study.threats]
+    about = (
+        f"[`{data}`]({relpath(ROOT / data, FOLDER)}) has the rows. "
+        f"[`{Path(rule).name}`]({relpath(ROOT / rule, FOLDER)}) has the places, seeds "
+        f"and budgets. `make results ONLY={study.name}` makes missing rows. "
+        f"{study.note} [How to read this page](index.md)."
+    )
+    code = f'import pandas as pd\n\ndrives = pd.read_csv("{data}")\n{made.pandas}'
+    parts = [
+        f"# {made.title}",
+        MARK,
+        f"![{made.title}.]({picture})",
+        _wrapped(" ".join(made.sentences)),
+        markdown(made.head, made.rows),
+        "## Threats to validity",
+        "\n".join(_wrapped(f"- {threat}", "  ") for threat in threats),
+        "## Data",
+        _wrapped(" ".join(about.split())),
+        f"```python\n{code}\n```",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _wrapped(text: str, indent: str = "") -> str:
+    """Break lines at 100 characters; links stay whole."""
+    return textwrap.fill(
+        text,
+        100,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )

@@ -1,0 +1,274 @@
+"""The studies of bench/results.toml: plan, state, runs, checks and findings."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+
+from bench.__main__ import main
+from bench.studies import plan, run
+from bench.studies.charts import draw_heat, draw_ratios
+from bench.studies.findings import FINDINGS, finding, is_farther, is_majority
+from bench.studies.pages import FOLDER, page_text
+from bench.studies.plan import ROOT, Study, read_plan, state, wanted_labels
+from mi_nerfattack import cli
+from mi_nerfattack.drives.table import with_starts
+from mi_nerfattack.experiment.sweep.grid import load_cells
+from mi_nerfattack.experiment.sweep.table import COLUMNS, make_table, write_table
+from mi_nerfattack.io import files
+
+STUDIES = {study.name: study for study in read_plan().studies}
+PAGES = {study.finding: study for study in STUDIES.values() if study.finding}
+GRID = """
+scenario = "bundled:base.toml"
+seeds = [1, 2]
+routes = [{ name = "a", set.scene.route = "left" }, { name = "b" }]
+methods = [{ name = "one" }, { name = "two", set.attack.method.max_iterations = 3 }]
+objects = [{ name = "near", routes = ["b"] }, { name = "far" }]
+"""
+
+
+def table(errors: dict[str, list[float]], **labels: str) -> pd.DataFrame:
+    """Return one drive per case and place of a sweep, with these mean errors (m)."""
+    labels = {"method": "gradient", "route": "left", "objects": "car"} | labels
+    rows = [
+        labels
+        | {"cell": f"{labels['method']}{seed}", "seed": seed, "case": case, "run": 0}
+        | {"environment": "surrogate", "frames": 9, "steps": 4, "status": "complete"}
+        | {"cross_track_mean_m": error, "wheel_out_s": 0.0, "departed": error > 1}
+        for case, values in errors.items()
+        for seed, error in enumerate(values)
+    ]
+    return make_table(rows)
+
+
+def drives(*tables: pd.DataFrame) -> pd.DataFrame:
+    rows = with_starts(pd.concat(tables), "cell")
+    return rows.assign(scenario=rows["route"] + ", " + rows["objects"])
+
+
+@pytest.mark.parametrize("study", STUDIES.values(), ids=list(STUDIES))
+def test_studies_name_files_that_exist(study):
+    for path in filter(None, (study.grid, *study.pages)):
+        assert (ROOT / path).exists()
+    known = {item.file for item in read_plan().inputs}
+    assert set(study.inputs) <= known
+    one = state(study, compare=False)
+    assert 0 <= one.done <= one.wanted
+    assert one.hours_left == pytest.approx((one.wanted - one.done) * study.core_hours)
+
+
+def test_wanted_labels_are_those_of_the_cells(tmp_path):
+    (path := tmp_path / "grid.toml").write_text(GRID)
+    for grid in (path, ROOT / "bench/quick.toml"):
+        cells = load_cells(grid)
+        labels = [(c.route, c.objects, c.method, c.budget, c.seed) for c in cells]
+        assert wanted_labels(grid) == labels
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page_is_what_its_table_gives(name):
+    study = PAGES[name]
+    made, picture = finding(study), f"../pictures/finding_{name}.png"
+    assert made is not None
+    text = page_text(study, made, state(study, compare=False), picture)
+    page = (FOLDER / f"{name}.md").read_text("utf-8")
+    assert page == text, "run python -m bench results --pages"
+    assert 0 < (ROOT / f"docs/pictures/finding_{name}.png").stat().st_size < 100_000
+    assert len(made.sentences) == 3 and len(made.pandas.splitlines()) == 2
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_the_lines_of_pandas_run(name, capsys, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    page = (FOLDER / f"{name}.md").read_text("utf-8")
+    exec(page.partition("```python\n")[2].removesuffix("```\n"), {})
+    assert len(capsys.readouterr().out.splitlines()) > 2
+
+
+def made(name: str, rows: pd.DataFrame):
+    return FINDINGS[name][1](rows)
+
+
+def test_a_side_is_farther_if_wilsons_interval_lies_above_one_half():
+    """All of 6 places: low end 6 / (6 + 1.96²) = 0.61; 5 of 6: 0.44; of 4: unknown."""
+    for errors, wanted in (
+        ([0.2] * 6, (6, True)),
+        ([0.2] * 5 + [0.05], (5, False)),
+        ([0.2] * 4, (4, False)),
+    ):
+        other = drives(table({"attack": [0.1] * len(errors)}))
+        assert is_farther(drives(table({"attack": errors})), other) == wanted
+
+
+def test_equal_sides_are_seldom_farther_by_chance():
+    """By the binomial distribution, as docs/findings/index.md says: 4 % at most."""
+    for places in range(5, 41):
+        majorities = [k for k in range(places + 1) if is_majority(k, places)]
+        ways = sum(math.comb(places, k) for k in majorities)
+        assert 0 < ways / 2**places < 0.04
+
+
+def test_the_attack_is_compared_with_the_worst_random_texture():
+    cases = ("no_object", "random", "best_random", "attack")
+    errors = {case: [0.1 + 0.1 * k] * 6 for k, case in enumerate(cases)}
+    rows = drives(table(errors), table(errors).assign(environment="deployment"))
+    found = made("attack", rows)
+    assert found.title.endswith("at 6 of 6 places")
+    assert "0.40 m" in found.sentences[0] and "ratio 1.3" in found.sentences[0]
+    rows.loc[rows["case"] == "attack", "cross_track_mean_m"] = 0.25
+    assert "not shown" in made("attack", rows).title
+
+
+def test_a_title_claims_nothing_while_attacks_are_missing(study):
+    labels = {"route": "a", "objects": "far", "method": "one"}
+    write(study.folder, table({"attack": [0.1] * 3}, **labels))  # seeds 0, 1, 2
+    found = finding(study.model_copy(update={"finding": "searches"}))
+    assert found.title.endswith("best: 2 of 12 attacks exist")
+
+
+def test_the_gradient_is_compared_with_each_search():
+    rows = drives(
+        table({"attack": [0.4] * 6}),
+        table({"attack": [0.2] * 6}, method="random"),
+        table({"attack": [0.5] * 6}, method="blocks"),
+    )
+    found = made("gradient", rows)
+    assert found.title == "The gradient beats 1 of 2 other searches"
+    assert [row[3] for row in found.rows] == ["2.00", "0.80"]
+    assert "`blocks`" in found.sentences[1] and "1 of 2 pairs" in found.sentences[2]
+
+
+def test_transfer_counts_environments_that_keep_half():
+    """The ratios of all attacks are equal, so their intervals are points."""
+    rows = [
+        {"attack": f"a{k}", "environment": where, "condition": "day", "case": "attack"}
+        | {"cross_track_mean_m": factor * (1 + k)}
+        for where, factor in (("surrogate", 1.0), ("kept", 0.8), ("lost", 0.2))
+        for k in range(5)
+    ]
+    found = made("transfer", pd.DataFrame(rows))
+    assert "in 1 of 2 environments, and lose it in 1" in found.title
+    assert found.rows == [
+        ["kept", "0.80", "0.80 to 0.80"],
+        ["lost", "0.20", "0.20 to 0.20"],
+    ]
+
+
+def test_charts_draw_ratios_intervals_and_heat():
+    draw_ratios(figure := Figure(), {"a": (2.0, [1.5, 3.0]), "b": (0.5, None)})
+    lines = [line.get_xdata() for line in figure.axes[0].lines]
+    assert [list(x) for x in lines[:4]] == [[1.5, 3.0], [2.0], [0.5, 0.5], [0.5]]
+    heat = pd.DataFrame([[1.0, np.nan]], ["surrogate"], ["day", "noon"])
+    draw_heat(figure := Figure(), heat)
+    (image,) = figure.axes[0].images
+    assert image.get_array().filled(-1).tolist() == [[1.0, -1.0]]
+    assert [text.get_text() for text in figure.axes[0].texts] == ["1.0"]
+
+
+def test_a_check_draws_whole_cells_until_a_tenth_of_the_rows():
+    rows = pd.concat(table({"attack": [0.1] * 20, "own": [0.1] * 20}) for _ in range(2))
+    drawn = run.drawn_rows(rows, 0.1, 3)  # 8 of 80 rows, 4 per cell
+    assert len(set(drawn)) == 2 and drawn == run.drawn_rows(rows, 0.1, 3)
+    assert drawn != run.drawn_rows(rows, 0.1, 4)
+    assert len(run.drawn_rows(rows, 1.0, 0)) == 20
+
+
+@pytest.fixture
+def study(tmp_path, monkeypatch):
+    """Return a study whose runs and table are in the test's folder."""
+    (tmp_path / "grid.toml").write_text(GRID)
+    monkeypatch.setattr(plan, "RUNS", tmp_path / "runs")
+    monkeypatch.setattr(run, "RUNS", tmp_path / "runs")
+    words = {"name": "one", "question": "?", "basis": "none", "core_hours": 1.0}
+    paths = {"table": str(tmp_path / "table"), "grid": str(tmp_path / "grid.toml")}
+    made = Study.model_validate(words | paths)
+    monkeypatch.setattr(run, "choose", lambda names: [made])
+    monkeypatch.setattr(run, "write_pages", lambda *args: [])
+    return made
+
+
+def write(folder, rows):
+    plain = rows[list(COLUMNS)].astype(object)
+    kept = plain.where(plain.notna(), None).to_dict("records")
+    about = {"digests": {}, "versions": None, "scenario": ""}
+    write_table(files.make_folder(folder), kept, dict.fromkeys(rows["cell"], about))
+
+
+def test_a_table_is_never_replaced_by_one_with_fewer_attacks(study, capsys):
+    for count, kept in ((2, 2), (1, 2), (3, 3)):
+        write(study.work, table({"attack": [0.1 * count] * count}))
+        run.refresh(study)
+        assert len(study.read()) == kept
+    assert "1 cells" in capsys.readouterr().out
+    document = json.loads((study.folder / "summary.json").read_text())
+    assert document["complete"] == 3
+
+
+def test_a_run_takes_the_committed_rows_and_goes_on_after_a_failure(study, monkeypatch):
+    calls = []
+
+    def fail(words, capture=False):
+        calls.append(words)
+        raise SystemExit(1)
+
+    monkeypatch.setattr(run, "run_command", fail)
+    assert main(["results", "--workers", "1"]) == 1
+    write(study.folder, table({"attack": [0.1]}))
+    assert main(["results"]) == 1
+    reported = study.model_copy(update={"report": "report {work} -o page.md"})
+    monkeypatch.setattr(run, "choose", lambda names: [reported])
+    assert main(["results"]) == 1  # no report after a failure
+    monkeypatch.setattr(run, "run_command", calls.append)
+    assert main(["results"]) == 0
+    sweep = ["sweep", study.grid, "-o", str(study.work)]
+    assert calls == [
+        [*sweep, "--workers", "1"],
+        *3 * [[*sweep, "--take", str(study.folder)]],
+        ["report", str(study.work), "-o", "page.md"],
+    ]
+
+
+def test_a_check_writes_the_differences_next_to_the_table(study, monkeypatch, capsys):
+    write(study.folder, table({"attack": [0.1] * 12}))
+    largest = {"cross_track_mean_m": 0.25}
+    cell = {"cell": "c", "rows": 2, "unmatched": 0, "error": None}
+    told = {"cells": [cell | {"largest_difference": largest}]}
+    monkeypatch.setattr(run, "run_command", lambda *a, **k: json.dumps(told))
+    assert main(["results", "--check", "--seed", "5", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    stored = json.loads((study.folder / "check.json").read_text())
+    for row in (document["one"], stored):
+        assert (row["largest_m"], row["rows"], row["of"], row["seed"]) == (
+            0.25,
+            2,
+            12,
+            5,
+        )
+
+
+def test_quick_compares_with_the_committed_rows(study, monkeypatch, capsys):
+    write(study.folder, table({"attack": [0.1, 0.2]}))
+    write(study.work, table({"attack": [0.1, 0.5, 0.7]}))
+    calls = []
+    monkeypatch.setattr(run, "run_command", lambda words: calls.append(words))
+    monkeypatch.setattr(run, "ROOT", study.work.parents[1])
+    assert main(["results", "--quick", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert "--take" not in calls[0] and document["compared"] == 2
+    assert document["largest_m"] == pytest.approx(0.3)
+
+
+def test_the_state_is_listed_and_wrong_options_are_refused(capsys):
+    assert main(["results", "--list", "--only", "retrain", "speed", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["speed"]["done"] == document["speed"]["wanted"]
+    assert document["hours_left"] == document["retrain"]["hours_left"] > 0
+    for words, where in ((["--only", "none"], "--only"), (["--list", "--check"], "--")):
+        assert main(["results", *words]) == cli.EXIT_INPUT
+        assert where in capsys.readouterr().err
