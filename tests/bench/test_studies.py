@@ -117,7 +117,7 @@ def test_equal_sides_are_seldom_farther_by_chance():
 def test_the_attack_is_compared_with_the_worst_random_texture():
     cases = ("no_object", "random", "best_random", "attack")
     errors = {case: [0.1 + 0.1 * k] * 6 for k, case in enumerate(cases)}
-    rows = drives(table(errors), table(errors).assign(environment="deployment"))
+    rows = drives(table(errors), table(errors).assign(environment="mitsuba"))
     found = made("attack", rows)
     assert found.title.endswith("at 6 of 6 places")
     assert "0.40 m" in found.sentences[0] and "ratio 1.3" in found.sentences[0]
@@ -137,10 +137,14 @@ def test_the_gradient_is_compared_with_each_search():
         table({"attack": [0.4] * 6}),
         table({"attack": [0.2] * 6}, method="random"),
         table({"attack": [0.5] * 6}, method="blocks"),
+        table({"attack": [0.1] * 6}, method="single_frame"),
     )
+    cheap = rows["method"] == "single_frame"
+    rows.loc[cheap, "frames"] = 7  # of 9
     found = made("gradient", rows)
-    assert found.title == "The gradient beats 1 of 2 other searches"
-    assert [row[3] for row in found.rows] == ["2.00", "0.80"]
+    assert found.title == "The gradient beats 1 of 2 other searches at equal cost"
+    assert "`single_frame`" in found.threats[0] and len(found.threats) == 1
+    assert [row[3] for row in found.rows] == ["2.00", "0.80", "4.00"]
     assert "`blocks`" in found.sentences[1] and "1 of 2 pairs" in found.sentences[2]
 
 
