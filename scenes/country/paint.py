@@ -39,8 +39,9 @@ def road_image(seed: int) -> np.ndarray:
     wheels = np.abs(np.abs(np.abs(offset) - LANE_WIDTH / 2) - 0.75)
     tone = tone - 0.025 * np.exp(-((wheels / 0.3) ** 2))
     for s0, s1, o0, o1, change in (
-        (36, 41, -3.0, -0.3, -0.05), (57, 60, 0.2, 2.8, 0.04), (78, 84, 0.3, 3.0, -0.04),
-        (96, 99, -2.9, -0.2, 0.045), (113, 117, -3.0, -0.5, -0.05),
+        (36, 41, -3.0, -0.3, -0.05), (57, 60, 0.2, 2.8, 0.04),
+        (78, 84, 0.3, 3.0, -0.04), (96, 99, -2.9, -0.2, 0.045),
+        (113, 117, -3.0, -0.5, -0.05),
     ):  # fmt: skip
         patch = np.minimum(
             np.minimum(s - s0, s1 - s), np.minimum(offset - o0, o1 - offset)
@@ -65,10 +66,9 @@ def ground_image(seed: int) -> np.ndarray:
     scale = GROUND_PIXELS / (2 * EXTENT)
     x, y = pixel_grid(-EXTENT, EXTENT, -EXTENT, EXTENT, scale)
     distance = road_distance(x, y)
-    tone = 0.09 * value_noise(x, y, 11.0, seed) + 0.07 * value_noise(
-        x, y, 4.0, seed + 1
-    )
-    tone = tone + 0.09 * value_noise(x, y, 1.1, seed + 2)
+    tone = 0.0
+    for amplitude, cell in ((0.11, 11.0), (0.09, 4.0), (0.13, 1.1)):
+        tone = tone + amplitude * value_noise(x, y, cell, seed + round(cell))
     dry = 0.5 + 0.5 * value_noise(x, y, 7.0, seed + 3)
     colour = _GRASS * (1 + tone[..., None])
     colour = colour + dry[..., None] * np.array([0.06, 0.02, 0.01])

@@ -54,7 +54,7 @@ class Plants:
         self._scenery.solid(foot, radii, [0.0, 0.6, stem + 0.9], colour, 7)
         middle = foot + [0, 0, stem + 1.45 * scale]
         size = scale * np.array([1.45, 1.45, 1.6])
-        self.ball(middle, size, species, 2)
+        self.ball(middle, size, species, 2 if lumps > 3 else 1)
         for k in range(lumps):
             angle = 2 * np.pi * (k + self._rng.uniform(-0.3, 0.3)) / lumps
             out = scale * self._rng.uniform(0.85, 1.25)
@@ -98,34 +98,22 @@ class Plants:
         """Append a hedge along the road.
 
         Args:
-            start, end: arc lengths, metres.
+            start: where it begins, arc length, metres.
+            end: where it ends, arc lengths, metres.
             offset: of its middle from the centre line, metres.
             top: its height, metres.
         """
         s = np.linspace(start, end, round((end - start) / 0.8) + 1)
-        outline = np.array(
-            [(-0.9, 0.0), (0.9, 0.0), (1, 0.45), (0.75, 0.9), (0, 1), (-0.75, 0.9), (-1, 0.45)]
-        )  # fmt: skip
-        # seen from the last ring the section runs counter-clockwise with left first
-        outline = outline[::-1] * [1, 1]
-        jitter = 1 + self._rng.uniform(-0.14, 0.14, (len(s), len(outline), 2))
-        section = outline * jitter * [_HEDGE_HALF, top]
+        half = np.array([0.75, 0, -0.75, -1, -0.9, 0.9, 1])
+        rise = np.array([0.9, 1, 0.9, 0.45, 0, 0, 0.45])
+        jitter = 1 + self._rng.uniform(-0.14, 0.14, (2, len(s), len(half)))
+        across = offset + _HEDGE_HALF * half * jitter[0]
+        up = top * rise * jitter[1]
         foot = height(*at(s, offset).T, self._seed) - 0.1
-        rings = np.stack(
-            [
-                np.concatenate(
-                    [
-                        at(s, offset + section[:, k, 0]),
-                        (foot + section[:, k, 1])[:, None],
-                    ],
-                    1,
-                )
-                for k in range(len(outline))
-            ],
-            axis=1,
-        )
+        plan = at(np.broadcast_to(s[:, None], up.shape), across)
+        rings = np.concatenate([plan, (foot[:, None] + up)[..., None]], axis=-1)
         u = np.abs(np.mod(s / 3.0, 2.0) - 1.0)  # back and forth, without a seam
-        v = 1 - section[:, :, 1] / (1.2 * top)
+        v = 1 - up / (1.2 * top)
         units = np.stack([np.broadcast_to(u[:, None], v.shape), v], axis=-1)
         self._tube(rings, units, "hedge")
 
@@ -138,7 +126,7 @@ def plant(seed: int, scenery: Scenery) -> MeshBuilder:
     rng = np.random.default_rng(seed + 1)
     taken = np.zeros((0, 2))
     # single trees on the slopes, then a belt of them on the crest
-    for count, low, high, gap, lumps in ((48, 11.5, 34, 6.5, 5), (95, 36, 47, 5.0, 2)):
+    for count, low, high, gap, lumps in ((48, 11.5, 34, 6.5, 5), (95, 36, 47, 5.0, 3)):
         tries = rng.uniform(-EXTENT + 8, EXTENT - 8, (6000, 2))
         distance = road_distance(*tries.T)
         clear = np.hypot(*(tries - YARD).T) > YARD_RADIUS + 2
