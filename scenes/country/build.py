@@ -43,7 +43,7 @@ def build(folder: Path, seed: int) -> list[Path]:
     scene = scene_xml(
         "Country road: metres, z up, linear image needs no exposure.",
         fov="60",
-        lookat='origin="-34, -44, 30" target="2, 6, 0" up="0, 0, 1"',
+        lookat='origin="-20, -56, 62" target="-6, 2, 0" up="0, 0, 1"',
         lights=sun_and_sky("0.36, -0.52, 0.77"),
         wraps=dict.fromkeys(meshes, "clamp"),
     )

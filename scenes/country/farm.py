@@ -24,7 +24,7 @@ BARN = Building(
     gable=True,
 )
 #: Fences: arc lengths from and to, offset from the centre line.
-FENCES = [(56.0, 94.0, -8.0), (22.0, 52.0, 8.0), (104.0, 126.0, 8.5)]
+FENCES = [(56.0, 94.0, -8.0), (22.0, 52.0, 8.0), (107.0, 127.0, 8.5)]
 _PANEL = 2.5
 #: Arc lengths of the marker posts, and how far off the centre line they stand.
 MARKERS, MARKER_OFFSET = np.arange(10.0, 146.0, 12.0), 4.5

@@ -85,7 +85,7 @@ def ground_image(seed: int) -> np.ndarray:
     gravel = np.array([0.66, 0.61, 0.53]) * (1 + 0.7 * tone[..., None])
     yard = YARD_RADIUS - 3.0 - np.hypot(x - YARD[0], y - YARD[1] + 3.0)
     drive = np.minimum(1.7 - np.abs(x - YARD[0] + 4.0), YARD[1] - 4.0 - y)
-    paths = np.maximum(yard, np.minimum(drive, y + 2.0))
+    paths = np.maximum(yard, np.minimum(drive, y + 9.5))
     mix = coverage(paths + 0.5 * value_noise(x, y, 1.5, seed + 5), scale)[..., None]
     colour = colour * (1 - mix) + gravel * mix
     mown = coverage(5.2 - distance + 0.4 * value_noise(x, y, 2.5, seed + 6), scale)
