@@ -36,7 +36,7 @@ def _fence(
     """Append posts with two rails along the road."""
     s = np.linspace(start, end, round((end - start) / _PANEL) + 1)
     posts = at(s, offset)
-    foot = height(*posts.T, seed) - 0.1
+    foot = height(posts, seed) - 0.1
     for (x, y), z in zip(posts, foot, strict=True):
         scenery.box((x, y, z), (0.13, 0.13, 1.3), "wood")
     for one, two, z in zip(posts, posts[1:], foot, strict=False):
@@ -97,7 +97,7 @@ def furnish(scenery: Scenery, seed: int) -> None:
         (-40, -24, 2.2),
         (8, -24, 0),
     ):
-        z = float(height(np.array(cx), np.array(cy), seed))
+        z = float(height(np.array([cx, cy]), seed))
         scenery.disc((cx, cy, z + 0.65), 0.75, 1.2, face, "wood")
     for k, colour in enumerate(("red", "wood")):
         scenery.box((x - 8 + 2 * k, y - 2, 0), (1.2, 0.9, 1.2), colour)

@@ -29,16 +29,15 @@ def _ramp(t: np.ndarray) -> np.ndarray:
     return t * t * (3 - 2 * t)
 
 
-def height(x: np.ndarray, y: np.ndarray, seed: int) -> np.ndarray:
-    """Return the height of the ground, metres: hills that close the horizon.
+def height(places: np.ndarray, seed: int) -> np.ndarray:
+    """Return the height of the ground (...), metres: hills that close the horizon.
 
     Args:
-        x: world coordinates, metres, of any shape.
-        y: likewise, of the same shape.
+        places: (..., 2), world coordinates, metres.
         seed: of the hills.
     """
-    x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
-    distance = road_distance(x, y)
+    x, y = places[..., 0], places[..., 1]
+    distance = road_distance(places)
     hills = _HILL * (1 + 0.45 * value_noise(x, y, 38.0, seed))
     hills = hills * _ramp((distance - FLAT) / (_CREST - FLAT))
     bumps = 0.3 * value_noise(x, y, 9.0, seed + 1) * _ramp((distance - FLAT) / 10)
@@ -55,12 +54,12 @@ def hills(seed: int) -> MeshBuilder:
     mesh = MeshBuilder()
     n = round(2 * EXTENT / _SPACING) + 1
     line = np.linspace(-EXTENT, EXTENT, n)
-    x, y = (v.ravel() for v in np.meshgrid(line, line))
+    places = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     corner = np.arange(n * (n - 1)).reshape(n - 1, n)[:, :-1].ravel()
     quads = np.stack([corner, corner + 1, corner + n + 1, corner + n], axis=1)
     faces = quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
-    uv = np.stack([0.5 + x / (2 * EXTENT), 0.5 - y / (2 * EXTENT)], axis=1)
-    mesh.add(np.stack([x, y, height(x, y, seed)], axis=1), uv, faces)
+    uv = 0.5 + places * [1, -1] / (2 * EXTENT)
+    mesh.add(np.column_stack([places, height(places, seed)]), uv, faces)
     return mesh
 
 

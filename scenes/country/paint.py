@@ -65,7 +65,7 @@ def ground_image(seed: int) -> np.ndarray:
     """Return the ground from above: verges, meadow, fields, the yard and its drive."""
     scale = GROUND_PIXELS / (2 * EXTENT)
     x, y = pixel_grid(-EXTENT, EXTENT, -EXTENT, EXTENT, scale)
-    distance = road_distance(x, y)
+    distance = road_distance(np.stack([x, y], axis=-1))
     tone = 0.0
     for amplitude, cell in ((0.11, 11.0), (0.09, 4.0), (0.13, 1.1)):
         tone = tone + amplitude * value_noise(x, y, cell, seed + round(cell))

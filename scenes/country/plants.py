@@ -38,12 +38,12 @@ class Plants:
         """Append a closed lump of leaves around a centre (3,), metres."""
         ball, unit = lumpy_ball(self._rng, subdivisions)
         vertices = ball.vertices * np.asarray(radii) + np.asarray(centre)
-        # leaves are darker below: the foot of a ball shows the foot of the image
         self.mesh.add(vertices, leaves_uv(species, unit), ball.faces)
 
     def tree(self, x: float, y: float, scale: float, species: str, lumps: int) -> None:
         """Append a tree with a round crown of some lumps, or a spruce."""
-        foot = np.array([x, y, float(height(x, y, self._seed)) - 0.15])
+        ground = float(height(np.array([x, y]), self._seed))
+        foot = np.array([x, y, ground - 0.15])
         if species == "spruce":
             self._scenery.solid(foot, [0.2, 0.14], [0.0, 1.6 * scale], "trunk", 6)
             self._cone(foot, scale)
@@ -109,7 +109,7 @@ class Plants:
         jitter = 1 + self._rng.uniform(-0.14, 0.14, (2, len(s), len(half)))
         across = offset + _HEDGE_HALF * half * jitter[0]
         up = top * rise * jitter[1]
-        foot = height(*at(s, offset).T, self._seed) - 0.1
+        foot = height(at(s, offset), self._seed) - 0.1
         plan = at(np.broadcast_to(s[:, None], up.shape), across)
         rings = np.concatenate([plan, (foot[:, None] + up)[..., None]], axis=-1)
         u = np.abs(np.mod(s / 3.0, 2.0) - 1.0)  # back and forth, without a seam
@@ -128,17 +128,17 @@ def plant(seed: int, scenery: Scenery) -> MeshBuilder:
     # single trees on the slopes, then a belt of them on the crest
     for count, low, high, gap, lumps in ((48, 11.5, 34, 6.5, 5), (95, 36, 47, 5.0, 3)):
         tries = rng.uniform(-EXTENT + 8, EXTENT - 8, (6000, 2))
-        distance = road_distance(*tries.T)
-        clear = np.hypot(*(tries - YARD).T) > YARD_RADIUS + 2
+        distance = road_distance(tries)
+        clear = np.linalg.norm(tries - YARD, axis=1) > YARD_RADIUS + 2
         planted = 0
-        for place in tries[(distance > low) & (distance < high) & clear]:
+        for x, y in tries[(distance > low) & (distance < high) & clear]:
             if planted == count:
                 break
-            if len(taken) and np.hypot(*(taken - place).T).min() < gap:
+            if np.hypot(taken[:, 0] - x, taken[:, 1] - y).min(initial=gap) < gap:
                 continue
-            taken, planted = np.vstack([taken, place]), planted + 1
+            taken, planted = np.vstack([taken, (x, y)]), planted + 1
             species = _SPECIES[int(rng.integers(len(_SPECIES)))]
-            plants.tree(*place, rng.uniform(0.9, 1.6), species, lumps)
+            plants.tree(x, y, rng.uniform(0.9, 1.6), species, lumps)
     for end in (0.0, LENGTH):
         _close(plants, end)
     return plants.mesh
@@ -153,7 +153,6 @@ def _close(plants: Plants, end: float) -> None:
     for k in range(-3, 4):
         for row in range(2):
             x, y = place + outward * (_GROVE + 4 * row) + side * (3.2 * k + 1.6 * row)
-            if road_distance(np.array(x), np.array(y)) > 5:
-                plants.tree(
-                    x, y, 1.0 + 0.1 * ((k + row) % 3), _SPECIES[(k + row) % 5], 3
-                )
+            if road_distance(np.array([x, y])) > 5:
+                scale, species = 1.0 + 0.1 * ((k + row) % 3), _SPECIES[(k + row) % 5]
+                plants.tree(x, y, scale, species, 3)

@@ -153,7 +153,7 @@ def test_country_routes_have_the_radii_and_lengths_of_the_plan() -> None:
 )
 def test_distance_to_the_centre_line(s: float, offset: float, expected: float) -> None:
     x, y = layout.at(np.array([s]), offset)[0]
-    distance = layout.road_distance(np.array(x), np.array(y))
+    distance = layout.road_distance(np.array([x, y]))
     assert distance == pytest.approx(expected, abs=5e-4)
 
 
@@ -162,7 +162,7 @@ def test_distance_beyond_the_ends_is_the_distance_to_the_end() -> None:
         angle = angle + layout.heading_at(s) + 0.4
         end = layout.at(np.array([s]))[0]
         x, y = end + 7.0 * np.array([np.cos(angle), np.sin(angle)])
-        distance = layout.road_distance(np.array(x), np.array(y))
+        distance = layout.road_distance(np.array([x, y]))
         assert distance == pytest.approx(7.0, abs=1e-9)
 
 
@@ -171,17 +171,16 @@ def test_country_ground_faces_up_and_is_flat_beside_the_road() -> None:
     up = top.face_normals[:, 2] > 0.999
     assert np.abs(top.face_normals[~up, 2]).max() < 1e-9  # the sides are upright
     np.testing.assert_array_equal(np.unique(top.triangles[up][:, :, 2]), [0.0])
-    side = np.cross(top.face_normals[~up], [0, 0, 1])
     middle = top.triangles_center[~up]
     outward = [
-        layout.road_distance(*(middle + sign * 0.1 * top.face_normals[~up])[:, :2].T)
+        layout.road_distance((middle + sign * 0.1 * top.face_normals[~up])[:, :2])
         for sign in (-1, 1)
     ]
-    assert len(side) and (outward[1] > outward[0]).all()
+    assert (~up).any() and (outward[1] > outward[0]).all()
 
     hills = mesh_of(ground.hills(SEED))
     assert hills.face_normals[:, 2].min() > 0.5  # slopes below 60 degrees
-    distance = layout.road_distance(*hills.vertices[:, :2].T)
+    distance = layout.road_distance(hills.vertices[:, :2])
     flat = hills.vertices[distance < ground.FLAT, 2]
     np.testing.assert_allclose(flat, ground.VERGE_HEIGHT, atol=1e-12)
     # a triangle of the road's surface has no corner that the slope has raised
@@ -200,7 +199,7 @@ def test_country_leaves_are_closed_and_none_is_over_the_road() -> None:
     ends = layout.at(np.array([0.0, layout.LENGTH]))
     to_end = np.linalg.norm(place[:, None] - ends, axis=2).min(axis=1)
     beside = place[to_end > 12.0]  # groves close the road where it ends
-    assert layout.road_distance(*beside.T).min() > ground.HALF_ROAD + 2.5
+    assert layout.road_distance(beside).min() > ground.HALF_ROAD + 2.5
 
 
 def test_objects_find_places_beside_the_country_road(folder, variant) -> None:
@@ -215,7 +214,7 @@ def test_objects_find_places_beside_the_country_road(folder, variant) -> None:
         )
         assert pose.translation[2] == pytest.approx(ground.VERGE_HEIGHT, abs=1e-3)
         x, y, _ = pose.translation
-        assert layout.road_distance(np.array(x), np.array(y)) > layout.LANE_WIDTH
+        assert layout.road_distance(np.array([x, y])) > layout.LANE_WIDTH
 
 
 def test_country_road_says_where_its_files_go(monkeypatch, capsys) -> None:
