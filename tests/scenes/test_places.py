@@ -17,9 +17,9 @@ from mi_nerfattack.deploy.car import CAR, SMALL_CAR, Car
 from mi_nerfattack.deploy.place import bundled_place
 from mi_nerfattack.io import files
 from mi_nerfattack.scenes import bundled
-from mi_nerfattack.scenes.country import build, ground, layout, plants
+from mi_nerfattack.scenes.country import build, ground, layout, paint, plants
 from mi_nerfattack.scenes.mesh import MeshBuilder
-from mi_nerfattack.scenes.paint import coverage
+from mi_nerfattack.scenes.paint import coverage, pixel_grid
 from mi_nerfattack.scenes.scenery import Scenery
 from mi_nerfattack.vehicle.route.route import Route, load_routes
 
@@ -186,6 +186,47 @@ def test_country_ground_faces_up_and_is_flat_beside_the_road() -> None:
     # a triangle of the road's surface has no corner that the slope has raised
     assert ground.FLAT - 2.5 * 2**0.5 > ground.HALF_ROAD
     assert hills.vertices[:, 2].max() > 5.0
+
+
+def pixel_of(uv: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return rows and columns of the pixels that coordinates (n, 2) lie in."""
+    column, row = np.clip(
+        (uv * shape[::-1]).astype(int), 0, np.array(shape[::-1]) - 1
+    ).T
+    return row, column
+
+
+def test_country_images_lie_on_their_meshes_as_they_were_painted() -> None:
+    """A vertex shows the pixel that was painted for its place, to one pixel."""
+    e = ground.EXTENT
+    scale = paint.GROUND_PIXELS / (2 * e)
+    x, y = pixel_grid(-e, e, -e, e, scale)
+    vertices, uv, _ = ground.hills(SEED).arrays()
+    pixels = pixel_of(uv, x.shape)
+    np.testing.assert_allclose(x[pixels], vertices[:, 0], atol=0.51 / scale)
+    np.testing.assert_allclose(y[pixels], vertices[:, 1], atol=0.51 / scale)
+
+    half, scale = ground.HALF_ROAD, paint.ROAD_SCALE
+    s, offset = pixel_grid(0, layout.LENGTH, -half, half, scale)
+    vertices, uv, _ = ground.road().arrays()
+    pixels = pixel_of(uv, s.shape)
+    painted = layout.at(s[pixels], offset[pixels])
+    away = np.linalg.norm(painted - vertices[:, :2], axis=1)
+    assert away.max() < 1.1 / scale
+
+
+def test_country_road_is_marked_at_the_borders_of_its_lanes() -> None:
+    image = paint.road_image(SEED).mean(axis=2)
+    half = ground.HALF_ROAD
+    offset = pixel_grid(0, layout.LENGTH, -half, half, paint.ROAD_SCALE)[1][:, 0]
+    tone = image.mean(axis=1)
+    edge = np.abs(np.abs(offset) - layout.LANE_WIDTH + 0.12) < 0.03
+    lane = np.abs(np.abs(offset) - layout.LANE_WIDTH / 2) < 0.5
+    middle = np.abs(offset) < 0.03
+    assert tone[edge].min() > tone[lane].max() + 0.2
+    # dashes of 3 m in 7.5 m
+    share = (image[middle].mean(axis=0) > 0.62).mean()
+    assert share == pytest.approx(3 / 7.5, abs=0.02)
 
 
 def test_country_leaves_are_closed_and_none_is_over_the_road() -> None:
