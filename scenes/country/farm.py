@@ -51,9 +51,9 @@ def _marker(scenery: Scenery, s: float, offset: float) -> None:
     """Append a white post with a dark band."""
     (x, y), angle = at(np.array([s]), offset)[0], heading_at(s)
     for z, size, colour in (
-        (-0.1, (0.1, 0.12, 0.75), "white"),
-        (0.65, (0.11, 0.13, 0.2), "dark"),
-        (0.85, (0.1, 0.12, 0.12), "white"),
+        (-0.1, (0.15, 0.17, 0.75), "white"),
+        (0.65, (0.16, 0.18, 0.2), "dark"),
+        (0.85, (0.15, 0.17, 0.12), "white"),
     ):
         scenery.box((x, y, z), size, colour, angle)
 
