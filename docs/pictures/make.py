@@ -14,6 +14,7 @@ from mi_nerfattack import variant
 
 variant.ensure()  # before what imports mitsuba
 
+import country_road  # noqa: E402
 import diagrams  # noqa: E402
 import flat_objects  # noqa: E402
 import gallery_blocks  # noqa: E402
@@ -25,6 +26,7 @@ import run_pictures  # noqa: E402
 PICTURES: dict[str, Callable[[Path, bool], None]] = {
     "loop": diagrams.draw_loop,
     "chart": diagrams.draw_chart,
+    "country": country_road.draw_country,
     "flat": flat_objects.draw_flat,
     "gallery": gallery_blocks.gallery,
     "glass": plugin_scenes.glass,

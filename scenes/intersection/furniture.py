@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .city import City
+from ..scenery import Scenery
 
 _CROWNS = ("crown_1", "crown_2", "crown_3")
 
@@ -29,7 +29,20 @@ HEDGES = [
 ]  # fmt: skip
 
 
-def _sign(city: City, x: float, y: float, face: float, colour: str, kind: str) -> None:
+def _lamp(city: Scenery, x: float, y: float, arm: tuple[float, float]) -> None:
+    """Append a lamp pole with an arm of the given extent over the road, metres."""
+    city.solid((x, y, 0), [0.14, 0.10, 0.08], [0.0, 0.9, 5.6], "pole", 8)
+    length = float(np.hypot(*arm))
+    angle = float(np.arctan2(arm[1], arm[0]))
+    middle = np.array([x + arm[0] / 2, y + arm[1] / 2, 5.5])
+    city.box(middle, (length, 0.12, 0.12), "pole", angle)
+    head = np.array([x + arm[0], y + arm[1], 5.42])
+    city.box(head, (0.75, 0.32, 0.2), "lamp", angle)
+
+
+def _sign(
+    city: Scenery, x: float, y: float, face: float, colour: str, kind: str
+) -> None:
     """Append a sign whose front looks along the angle face, radians."""
     city.solid((x, y, 0), [0.06, 0.06], [0.0, 2.0], "pole", 6)
     place = np.array([x, y, 0.0]) + 0.09 * np.array([np.cos(face), np.sin(face), 0])
@@ -45,7 +58,7 @@ def _sign(city: City, x: float, y: float, face: float, colour: str, kind: str) -
         city.disc(place + [0, 0, 2.3], 0.48, 0.1, face, colour)
 
 
-def _car(city: City, x: float, y: float, angle: float, colour: str) -> None:
+def _car(city: Scenery, x: float, y: float, angle: float, colour: str) -> None:
     """Append a parked car of two boxes on four dark wheels."""
     place = np.array([x, y, 0.12])
     city.box(place + [0, 0, 0.3], (4.2, 1.75, 0.62), colour, angle)
@@ -54,7 +67,7 @@ def _car(city: City, x: float, y: float, angle: float, colour: str) -> None:
     city.box(place, (3.3, 1.6, 0.3), "dark", angle)
 
 
-def _bus_stop(city: City, x: float, y: float) -> None:
+def _bus_stop(city: Scenery, x: float, y: float) -> None:
     """Append a shelter that opens to the south."""
     for dx in (-1.9, 1.9):
         for dy in (-0.6, 0.6):
@@ -65,7 +78,7 @@ def _bus_stop(city: City, x: float, y: float) -> None:
     city.box((x - 2.6, y - 0.3, 0.12), (0.5, 0.16, 1.9), "yellow")
 
 
-def _fence(city: City, start, end, colours: tuple[str, ...]) -> None:
+def _fence(city: Scenery, start, end, colours: tuple[str, ...]) -> None:
     """Append a fence of panels 2 m long in turning colours."""
     start, end = np.array(start, dtype=float), np.array(end, dtype=float)
     length = float(np.linalg.norm(end - start))
@@ -77,13 +90,13 @@ def _fence(city: City, start, end, colours: tuple[str, ...]) -> None:
         city.box((x, y, 0.12), size, colours[k % len(colours)], angle)
 
 
-def furnish(city: City) -> None:
+def furnish(city: Scenery) -> None:
     """Append everything that is not a building."""
     rng = np.random.default_rng(7)
     for k, (x, y) in enumerate(TREES):
         city.tree(x, y, rng.uniform(0.85, 1.25), _CROWNS[k % 3])
     for x, y, arm in LAMPS:
-        city.lamp(x, y, arm)
+        _lamp(city, x, y, arm)
     for (x, y), (width, depth), height in HEDGES:
         city.box((x, y, 0.0), (width, depth, height), "hedge")
     _bus_stop(city, -13.5, 6.9)

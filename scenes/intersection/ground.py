@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..mesh import MeshBuilder, level
 from .layout import (
     KERB_HEIGHT,
     KERB_RADIUS,
@@ -12,7 +13,6 @@ from .layout import (
     ROAD_END,
     corner_kerb,
 )
-from .mesh import MeshBuilder
 from .paint import SIDE_ROAD_TOP
 
 EXTENT = 400.0
@@ -21,19 +21,11 @@ _REPEAT = 16.0
 _TURN_STEPS = 12
 
 
-def road(x0: float, x1: float, y0: float, y1: float) -> MeshBuilder:
-    """Return a horizontal rectangle at z = 0 that shows its image once."""
-    mesh = MeshBuilder()
-    corners = [(x0, y0, 0), (x1, y0, 0), (x1, y1, 0), (x0, y1, 0)]
-    mesh.quad(np.array(corners), np.array([(0, 1), (1, 1), (1, 0), (0, 0)]))
-    return mesh
-
-
 def roads() -> dict[str, MeshBuilder]:
     """Return the meshes of the two road images; they share the edge at the seam."""
     return {
-        "road_main": road(-ROAD_END, ROAD_END, SIDE_ROAD_TOP, LANE_WIDTH),
-        "road_side": road(-LANE_WIDTH, LANE_WIDTH, -ROAD_END, SIDE_ROAD_TOP),
+        "road_main": level(-ROAD_END, ROAD_END, SIDE_ROAD_TOP, LANE_WIDTH),
+        "road_side": level(-LANE_WIDTH, LANE_WIDTH, -ROAD_END, SIDE_ROAD_TOP),
     }
 
 

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from ..place import route_entry
+
 LANE_WIDTH = 3.5
 ROAD_END = 45.0
 KERB_RADIUS = 5.0
@@ -90,11 +92,6 @@ def routes() -> dict[str, dict[str, Any]]:
         "left": _turn((half, -24.0), (half, half), (-30.0, half), 9.0),
     }
     return {
-        name: {
-            "goal": goal,
-            "lane_width_m": LANE_WIDTH,
-            "speed_ms": 5.0,
-            "points_m": [[round(v, 6) + 0.0 for v in p] for p in value.tolist()],
-        }
+        name: route_entry(value, goal=goal, lane_width=LANE_WIDTH, speed=5.0)
         for goal, (name, value) in enumerate(points.items())
     }

@@ -1,16 +1,10 @@
-"""Images painted with NumPy: smooth noise, road surface, pavement and grass.
-
-Colours are sRGB in [0, 1] until they are written as 8-bit PNG files.
-"""
+"""Images of the road surface, the pavement and the grass, sRGB in [0, 1]."""
 
 from __future__ import annotations
 
-import io
-from pathlib import Path
-
 import numpy as np
-from PIL import Image
 
+from ..paint import coverage, pixel_grid, value_noise
 from .layout import ROAD_END, road_depth
 
 PIXELS_PER_METRE = 25
@@ -19,29 +13,9 @@ WHITE = np.array([0.90, 0.90, 0.88])
 _LINE = 0.15
 
 
-def write_png(path: Path, image: np.ndarray) -> None:
-    """Write an sRGB image (h, w, 3) in [0, 1] as an 8-bit PNG."""
-    buffer = io.BytesIO()
-    data = np.clip(np.rint(image * 255), 0, 255).astype(np.uint8)
-    Image.fromarray(data).save(buffer, format="png", optimize=True)
-    path.write_bytes(buffer.getvalue())
-
-
-def value_noise(x: np.ndarray, y: np.ndarray, cell: float, seed: int) -> np.ndarray:
-    """Return smooth noise in [-1, 1] at x, y, metres, with features of size cell."""
-    lattice = np.random.default_rng(seed).uniform(-1, 1, (64, 64))
-    i, j = np.floor(x / cell).astype(int), np.floor(y / cell).astype(int)
-    u, v = x / cell - i, y / cell - j
-    u, v = u * u * (3 - 2 * u), v * v * (3 - 2 * v)
-    low = lattice[i % 64, j % 64] * (1 - u) + lattice[(i + 1) % 64, j % 64] * u
-    high = lattice[i % 64, (j + 1) % 64] * (1 - u)
-    high = high + lattice[(i + 1) % 64, (j + 1) % 64] * u
-    return low * (1 - v) + high * v
-
-
 def _inside(distance: np.ndarray) -> np.ndarray:
-    """Return the antialiased coverage of a region from its signed distance."""
-    return np.clip(0.5 + distance * PIXELS_PER_METRE, 0.0, 1.0)
+    """Return the coverage of a region of the road's images from its distance."""
+    return coverage(distance, PIXELS_PER_METRE)
 
 
 def _rectangle(x, y, x0, x1, y0, y1) -> np.ndarray:
@@ -90,17 +64,6 @@ def road_colour(x: np.ndarray, y: np.ndarray, seed: int) -> np.ndarray:
     wear = 0.93 + 0.05 * value_noise(x, y, 1.1, seed + 3)
     paint = (road_markings(x, y) * wear)[..., None]
     return colour * (1 - paint) + WHITE * paint
-
-
-def pixel_grid(
-    x0: float, x1: float, y0: float, y1: float, scale: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return x and y (h, w) of the pixel centres; row 0 lies at y1."""
-    width, height = round((x1 - x0) * scale), round((y1 - y0) * scale)
-    x = x0 + (np.arange(width) + 0.5) / scale
-    y = y1 - (np.arange(height) + 0.5) / scale
-    across, up = np.meshgrid(x, y)
-    return across, up
 
 
 def road_images(seed: int) -> dict[str, np.ndarray]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from ..intersection.city import City
-from ..intersection.mesh import MeshBuilder
+from ..mesh import MeshBuilder
+from ..scenery import Scenery
 
 # middle of the foot, size, colour, angle
 _BOXES = [
@@ -24,42 +24,42 @@ _TABLES = [((2.62, -0.6, 0), (0.6, 1.4, 0.72)), ((-2.65, -0.4, 0), (0.55, 1.2, 0
 _PLANTS = [(2.6, 2.1, 0.34, "crown_1"), (-2.65, -2.1, 0.28, "crown_3")]
 
 
-def _shelf(city: City, foot, width: float, height: float, colour: str) -> None:
+def _shelf(room: Scenery, foot, width: float, height: float, colour: str) -> None:
     """Append an open shelf along a wall with coloured boxes in it."""
     x, y, _ = foot
     for side in (-1, 1):
-        city.box((x + side * width / 2, y, 0), (0.04, 0.28, height), colour)
+        room.box((x + side * width / 2, y, 0), (0.04, 0.28, height), colour)
     fill = ("red", "blue", "yellow", "green", "dark", "orange")
     levels = 4
     for k in range(levels):
         z = 0.05 + k * (height - 0.1) / (levels - 1)
-        city.box((x, y, z), (width, 0.28, 0.04), colour)
+        room.box((x, y, z), (width, 0.28, 0.04), colour)
         if k < levels - 1:
             for i in range(3):
                 place = (x + (i - 1) * width / 3.3, y, z + 0.04)
-                city.box(place, (0.2, 0.2, 0.16 + 0.03 * i), fill[(k + 2 * i) % 6])
+                room.box(place, (0.2, 0.2, 0.16 + 0.03 * i), fill[(k + 2 * i) % 6])
 
 
-def _table(city: City, foot, size) -> None:
+def _table(room: Scenery, foot, size) -> None:
     """Append a table on four legs."""
     (x, y, _), (a, b, height) = foot, size
-    city.box((x, y, height - 0.05), (a, b, 0.05), "white")
+    room.box((x, y, height - 0.05), (a, b, 0.05), "white")
     for i in (-1, 1):
         for j in (-1, 1):
             leg = (x + i * (a / 2 - 0.05), y + j * (b / 2 - 0.05), 0)
-            city.box(leg, (0.05, 0.05, height - 0.05), "pole")
+            room.box(leg, (0.05, 0.05, height - 0.05), "pole")
 
 
 def furniture(seed: int) -> MeshBuilder:
     """Return everything that stands in the room as one mesh of plain colours."""
-    city = City(seed, 0)
+    room = Scenery(seed, 0)
     for foot, size, colour, angle in _BOXES:
-        city.box(foot, size, colour, angle)
+        room.box(foot, size, colour, angle)
     for foot, width, height, colour in _SHELVES:
-        _shelf(city, foot, width, height, colour)
+        _shelf(room, foot, width, height, colour)
     for foot, size in _TABLES:
-        _table(city, foot, size)
+        _table(room, foot, size)
     for x, y, scale, crown in _PLANTS:
-        city.solid((x, y, 0), [0.13, 0.17, 0.17], [0.0, 0.28, 0.29], "brick", 12)
-        city.tree(x, y, scale, crown)
-    return city.mesh
+        room.solid((x, y, 0), [0.13, 0.17, 0.17], [0.0, 0.28, 0.29], "brick", 12)
+        room.tree(x, y, scale, crown)
+    return room.mesh

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from ..place import route_entry
+
 LENGTH, WIDTH, HEIGHT = 6.0, 5.0, 2.7
 TRACK_HALF = 1.6
 CORNER_RADIUS = 1.1
@@ -52,12 +54,6 @@ def track() -> np.ndarray:
 
 def routes() -> dict[str, dict[str, Any]]:
     """Return the loop as routes.json holds it."""
-    return {
-        "square": {
-            "goal": 0,
-            "lane_width_m": LANE_WIDTH,
-            "speed_ms": SPEED_MS,
-            "closed": True,
-            "points_m": [[round(v, 6) + 0.0 for v in p] for p in track().tolist()],
-        }
-    }
+    loop = route_entry(track(), goal=0, lane_width=LANE_WIDTH, speed=SPEED_MS)
+    points = loop.pop("points_m")
+    return {"square": loop | {"closed": True, "points_m": points}}

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..intersection.facades import COLOURS
-from ..intersection.paint import pixel_grid, value_noise
+from ..atlas import COLOURS
+from ..paint import coverage, pixel_grid, value_noise
 from .layout import HEIGHT, LENGTH, TAPE_WIDTH, WIDTH, track_distance
 
 FLOOR_SCALE = 110.0
@@ -59,7 +59,7 @@ def floor_image(seed: int) -> np.ndarray:
     tone = tone - 0.07 * gap
     colour = tone[..., None] * np.array([1.0, 0.97, 0.92])
     edge = 0.5 * TAPE_WIDTH - np.abs(track_distance(x, y))
-    tape = np.clip(0.5 + edge * FLOOR_SCALE, 0, 1)[..., None]
+    tape = coverage(edge, FLOOR_SCALE)[..., None]
     return colour * (1 - tape) + _TAPE * tape
 
 

@@ -73,6 +73,7 @@ def assert_made(names: set[str], folder: Path) -> None:
     ("name", "pictures"),
     [
         ("plugins", PLUGINS),
+        ("country", {"country.jpg"}),
         ("glass", {"glass.jpg"}),
         ("light_maps", {"light_maps.jpg"}),
         ("gallery", GALLERY),
@@ -125,7 +126,7 @@ def test_the_chart_has_a_mark_for_each_drive():
 
 
 @pytest.mark.parametrize(
-    "name", sorted(PLUGINS | GALLERY | {"banner.jpg", "chart.png"})
+    "name", sorted(PLUGINS | GALLERY | {"banner.jpg", "chart.png", "country.jpg"})
 )
 def test_committed_pictures_show_something(name):
     assert_shows_something(read(DOCS / "pictures" / name))

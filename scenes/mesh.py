@@ -66,6 +66,14 @@ class MeshBuilder:
         path.write_bytes(header.encode("ascii") + body.tobytes() + rows.tobytes())
 
 
+def level(x0: float, x1: float, y0: float, y1: float) -> MeshBuilder:
+    """Return a rectangle at z = 0 that faces up and shows its image once, metres."""
+    mesh = MeshBuilder()
+    corners = [(x0, y0, 0), (x1, y0, 0), (x1, y1, 0), (x0, y1, 0)]
+    mesh.quad(np.array(corners), np.array([(0, 1), (1, 1), (1, 0), (0, 0)]))
+    return mesh
+
+
 def rotate_z(points: np.ndarray, angle: float) -> np.ndarray:
     """Rotate points (n, 3) about the z axis by angle, radians."""
     c, s = np.cos(angle), np.sin(angle)

@@ -1,0 +1,1 @@
+"""A country road: two curves, hedges, trees, a house."""
