@@ -45,9 +45,9 @@ class Roadside:
     quarter of its width and of its height, faces the traffic on the route to 4 degrees
     instead: by the wider of its -x and -y sides. A patch, which is lower than a quarter
     of its length and of its width, lies on the lane of the route instead, where the
-    lane is as good as straight, +y along the lane to 4 degrees, and the drive goes on for
-    2 s after it, or for half of its length where it is short. Each is seen from a drive
-    along the lane's centre: in frames of `view_s` together, not necessarily in a
+    lane is as good as straight, +y along the lane to 4 degrees, and the drive goes on
+    for 2 s after it, or for half of its length where it is short. Each is seen from a
+    drive along the lane's centre: in frames of `view_s` together, not necessarily in a
     row, about `view_px` pixels or more show a part of it that neither the scene nor
     another object hides, as 64 of its points tell.
 
