@@ -10,6 +10,7 @@ from bench.capture import BenchGaps, BenchPoses
 from bench.fit.bench import BenchFit
 from bench.gpu import BenchFrames, BenchGpu
 from bench.loop.bench import BenchLoop
+from bench.reach import BenchReach
 from bench.render.bench import BenchRender
 from bench.roughness import BenchRoughness
 from bench.splats import BenchSplats
@@ -24,6 +25,7 @@ COMMANDS = {
     "loop": BenchLoop,
     "splats": BenchSplats,
     "roughness": BenchRoughness,
+    "reach": BenchReach,
     "poses": BenchPoses,
     "gaps": BenchGaps,
     "frames": BenchFrames,

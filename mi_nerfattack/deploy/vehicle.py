@@ -190,8 +190,8 @@ class KinematicVehicle(AbstractVehicle):
         values = checked_control(control, self.control_names)
         self._controls.append(to_control(values[None]))
         index = len(self._controls) - 1
-        older, newer = self._transition.controls(self._controls, index, self._state)
-        self._state = self._transition.advance(self._state, older, newer)
+        acting = self._transition.controls(self._controls, index, self._state)
+        self._state = self._transition.advance(self._state, *acting)
 
     @property
     def state(self) -> np.ndarray:

@@ -346,8 +346,8 @@ def simulate(
         control, memory = loop.policy.step(image, loop.goal, memory, numbers)
         require_controls(control_size(control), loop.dynamics.control_names)
         controls.append(controls_as(dr.value_t(type(initial)), control))
-        older, newer = loop.transition.controls(controls, index, initial)
-        states.append(loop.transition.advance(states[-1], older, newer))
+        acting = loop.transition.controls(controls, index, initial)
+        states.append(loop.transition.advance(states[-1], *acting))
         dr.eval(controls[-1])
         if keep is not None:
             kept.append(keep(step))

@@ -187,9 +187,10 @@ class Sweep:
         """
         transition = self.loop.transition
         controls = self.drive.controls[: index + 1]
-        older, newer = transition.controls(controls, index, state)
-        d_state, *d_pair = transition.vjp(state, older, newer, d_after)
-        for source, value in zip(transition.sources(index), d_pair, strict=True):
+        acting = transition.controls(controls, index, state)
+        d_state, *d_acting = transition.vjp(state, acting, d_after)
+        sources = transition.sources(index, state)
+        for source, value in zip(sources, d_acting, strict=True):
             self.pending[source] = self.pending.get(source, 0) + value
         return d_state
 

@@ -13,11 +13,8 @@ from mi_nerfattack.ranges import NonNegative, Whole, checked
 from mi_nerfattack.render.lighting.lights import Sunlight
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics, Dubins
 
-_STREAM, _SUNS, _LAGS = (
-    4,
-    8,
-    9,
-)  # of the seed; disturbances and initial poses have others
+# Streams of the seed; disturbances and initial poses have others
+_STREAM, _SUNS, _LAGS, _DELAYS = 4, 8, 9, 10
 
 Range = tuple[float, float]
 
@@ -58,6 +55,8 @@ class Variation:
             wheelbase or by understeer.
         steering_lag_s_sd: of the number whose size is the time constant of its
             steering, seconds.
+        delay_s_sd: of the number whose size is the delay of its controls, seconds,
+            in addition to that of the closed loop.
         sun: sun and sky that light the objects; None for the light of their capture.
         seed: of all draws.
 
@@ -71,6 +70,7 @@ class Variation:
     speed_sd: NonNegative = 0.0
     steering_sd: NonNegative = 0.0
     steering_lag_s_sd: NonNegative = 0.0
+    delay_s_sd: NonNegative = 0.0
     sun: SunRanges | None = None
     seed: Whole = 0
 
@@ -88,13 +88,17 @@ class Variation:
     @property
     def of_vehicle(self) -> bool:
         """Whether the vehicle differs."""
-        return bool(self.speed_sd or self.steering_sd or self.steering_lag_s_sd)
+        answer = self.speed_sd or self.steering_sd
+        return bool(answer or self.steering_lag_s_sd or self.delay_s_sd)
 
     def draws(self, first: int, count: int) -> Draws:
         """Draw for `count` drives, of which the first has the number `first`."""
         random = np.random.default_rng([self.seed, _STREAM])
         normal = random.normal(size=(first + count, 8))[first:].T
-        lags = np.random.default_rng([self.seed, _LAGS]).normal(size=first + count)
+        lags, delays = (
+            abs(np.random.default_rng([self.seed, stream]).normal(size=first + count))
+            for stream in (_LAGS, _DELAYS)
+        )
         light = self.light_ev_sd * normal[0] + self.light_colour_ev_sd * normal[1:4]
         return Draws(
             2.0**light,
@@ -102,7 +106,8 @@ class Variation:
             np.exp(self.height_sd * normal[5]),
             np.exp(self.speed_sd * normal[6]),
             np.exp(self.steering_sd * normal[7]),
-            self.steering_lag_s_sd * np.abs(lags[first:]),
+            self.steering_lag_s_sd * lags[first:],
+            self.delay_s_sd * delays[first:],
         )
 
     def suns(self, first: int, count: int) -> list[Sunlight]:
@@ -123,6 +128,7 @@ class Draws:
         speed: (n,), factors of the vehicle's speed.
         steering: (n,), factors of its heading rate.
         lag_s: (n,), time constants of its steering, seconds.
+        delay_s: (n,), added to the delay of its controls, seconds.
     """
 
     light: np.ndarray
@@ -131,6 +137,7 @@ class Draws:
     speed: np.ndarray
     steering: np.ndarray
     lag_s: np.ndarray
+    delay_s: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -144,7 +151,7 @@ class Varied(AbstractDynamics):
 
     With a lag, the steering that acts is one row more, the last: it follows the command
     by a first-order lag from 0. The lag is at least an integration step, with which all
-    integrators are stable.
+    integrators are stable. A delay is the `Transition`'s to apply.
 
     Args:
         model: the vehicle.
@@ -199,6 +206,11 @@ class Varied(AbstractDynamics):
         moved = speed * slope[0], speed * slope[1], steering * slope[2]
         others = [slope[i] for i in range(3, len(slope))]
         return type(state)(*moved, *others, *lagging)
+
+    def delays(self, count: int) -> np.ndarray | None:
+        """See :meth:`AbstractDynamics.delays`."""
+        own = self.variation.draws(self.first, count).delay_s
+        return own if self.variation.delay_s_sd > 0 else None
 
     def saturate(self, control: Any) -> Any:
         """See :meth:`AbstractDynamics.saturate`."""

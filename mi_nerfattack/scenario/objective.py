@@ -296,7 +296,9 @@ class VarySection(Section):
     steering_sd: Logarithm = 0.0  # of the logarithm of its heading rate
     #: Of the number whose size is the time constant of the steering.
     steering_lag_s_sd: NonNegative = 0.0
-    later: ClassVar[tuple[str, ...]] = ("sun", "steering_lag_s_sd")
+    #: Of the number whose size adds to the delay of the controls.
+    delay_s_sd: NonNegative = 0.0
+    later: ClassVar[tuple[str, ...]] = ("sun", "steering_lag_s_sd", "delay_s_sd")
 
     def applied(self, loop: ClosedLoop, seed: int) -> ClosedLoop:
         """Return a loop whose drives differ.

@@ -248,6 +248,14 @@ class AbstractDynamics(ABC):
         del state
         return []
 
+    def delays(self, count: int) -> np.ndarray | None:
+        """Return delays (n,) of the controls of `count` vehicles, seconds, or None.
+
+        They add to that of the closed loop. By default there are none.
+        """
+        del count
+        return None
+
     def check(self, state: Any) -> None:
         """Raise `InputError` where a state (m, n) shows that the model has failed.
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+import numpy as np
 
 from mi_nerfattack.backend.arrays import vjp
 from mi_nerfattack.backend.freeze import freeze_method
@@ -204,6 +205,12 @@ class Transition:
     late``, the first `late` steps of a period still apply the older control. Before
     the first control arrives the vehicle gets the control 0.
 
+    Where the vehicles of a batch have delays (`AbstractDynamics.delays`), these add to
+    `delay`, and more than two controls may act in a period. A delay of ``n + f`` steps
+    need not be whole: an integration step then applies the mean over the step of what
+    arrives in it, ``f`` of the control n + 1 steps ago and ``1 - f`` of that n steps
+    ago. The derivative by the controls follows; a delay has none.
+
     Args:
         dynamics: the vehicle.
         integrator: its time step.
@@ -231,24 +238,33 @@ class Transition:
         self.integrator = integrator
         self.dt: float = period / substeps
         self.substeps = substeps
+        self.delay = delay
         self.lag: int = delay // substeps
         self.late: int = delay % substeps
+        self._shares: dict[Any, Shares | None] = {}
         calls = (self._advance, self._vjp)
         if dynamics.recordable:
             calls = tuple(freeze_method(call, self._beside) for call in calls)
         self._advance_call, self._vjp_call = calls
 
-    def sources(self, period: int) -> tuple[int, int]:
-        """Return the indices of the older and the newer control of a period.
+    def sources(self, period: int, like: Any) -> range:
+        """Return the indices of the controls that act in a period, oldest first.
 
         Negative indices stand for the control 0.
+
+        Args:
+            period: index.
+            like: any state (m, n) of the drive.
         """
-        return period - self.lag - 1, period - self.lag
+        shares = self.shares(like)
+        oldest = self.lag + 1 if shares is None else shares.oldest
+        newest = self.lag if shares is None else shares.newest
+        return range(period - oldest, period - newest + 1)
 
     def controls(
         self, controls: Sequence[Any], period: int, like: Any
     ) -> tuple[Any, ...]:
-        """Pick the older and the newer control out of a drive's.
+        """Pick the controls that act in a period out of a drive's, oldest first.
 
         Args:
             controls: raw controls of the periods 0 to `period`, (n,) or (k, n).
@@ -256,40 +272,113 @@ class Transition:
             like: any state of the drive.
         """
         none = no_control(self.dynamics.control_size, like)
-        return tuple(controls[i] if i >= 0 else none for i in self.sources(period))
+        sources = self.sources(period, like)
+        return tuple(controls[i] if i >= 0 else none for i in sources)
 
-    def advance(self, state: Any, older: Any, newer: Any) -> Any:
+    def advance(self, state: Any, *controls: Any) -> Any:
         """Drive one period; (m, n), evaluated, detached.
+
+        Args:
+            state: (m, n), before it.
+            controls: as :meth:`controls` picks them.
 
         Raises:
             InputError: an implicit step did not converge.
         """
-        path = self._advance_call(state, older, newer)
+        path = self._advance_call(state, *controls)
         dr.eval(path)
         for i, (before, after) in enumerate(zip(path[:-1], path[1:], strict=True)):
-            control = self.dynamics.saturate(older if i < self.late else newer)
-            self.integrator.check(self.dynamics, before, after, control, self.dt)
+            acting = self._acting(i, state, controls)
+            self.integrator.check(self.dynamics, before, after, acting, self.dt)
         return path[-1]
 
     def vjp(
-        self, state: Any, older: Any, newer: Any, cotangent: Any
+        self, state: Any, controls: Sequence[Any], cotangent: Any
     ) -> tuple[Any, ...]:
-        """Multiply (m, n) by the derivatives: those by state, older, newer."""
-        result = self._vjp_call(state, older, newer, cotangent)
+        """Multiply (m, n) by the derivatives: those by state and each control."""
+        result = self._vjp_call(state, cotangent, *controls)
         dr.eval(result)
         return result
 
-    def _advance(self, state: Any, older: Any, newer: Any) -> list[Any]:
+    def shares(self, like: Any) -> Shares | None:
+        """Return what share each control has; None where two act in turn.
+
+        Args:
+            like: any state (m, n) of the drive.
+        """
+        key = kind, count = dr.detached_t(type(like[0])), dr.width(like)
+        if key not in self._shares:
+            delays_s = self.dynamics.delays(count)
+            self._shares[key] = None
+            if delays_s is not None:
+                steps = self.delay + delays_s / self.dt
+                self._shares[key] = Shares.of(steps, self.substeps, kind)
+        return self._shares[key]
+
+    def _acting(self, step: int, state: Any, controls: Sequence[Any]) -> Any:
+        """Return the saturated control of an integration step."""
+        shares = self.shares(state)
+        if shares is None:
+            return self.dynamics.saturate(controls[0 if step < self.late else 1])
+        first, *others = zip(shares.weights[step], controls, strict=True)
+        command = first[0] * first[1]
+        for weight, control in others:
+            command = command + weight * control
+        return self.dynamics.saturate(command)
+
+    def _advance(self, state: Any, *controls: Any) -> list[Any]:
         path = [state]
         for i in range(self.substeps):
-            control = self.dynamics.saturate(older if i < self.late else newer)
-            path.append(self.integrator.step(self.dynamics, path[-1], control, self.dt))
+            acting = self._acting(i, state, controls)
+            path.append(self.integrator.step(self.dynamics, path[-1], acting, self.dt))
         return path
 
-    def _vjp(self, state: Any, older: Any, newer: Any, cotangent: Any) -> tuple:
-        return vjp(lambda x: self._advance(*x)[-1], (state, older, newer), cotangent)
+    def _vjp(self, state: Any, cotangent: Any, *controls: Any) -> tuple:
+        inputs = state, *controls
+        return vjp(lambda x: self._advance(*x)[-1], inputs, cotangent)
 
     def _beside(self, state: Any, *more: Any) -> list[Any]:
         """Return what a recording depends on beside the arguments, their sizes too."""
-        sizes = [dr.width(x) for x in (state, *more)]
-        return [sizes, self.dynamics.constants(state)]
+        sizes, shares = [dr.width(x) for x in (state, *more)], self.shares(state)
+        weights = [] if shares is None else shares.weights
+        return [sizes, self.dynamics.constants(state), weights]
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Shares of the latest controls in each integration step of a period.
+
+    Attributes:
+        oldest: control periods from the first control's to the period.
+        newest: from the last control's, at least 0.
+        weights: of each step and control, oldest first: (n,), opaque, in [0, 1].
+    """
+
+    oldest: int
+    newest: int
+    weights: list[list[Any]]
+
+    @classmethod
+    def of(cls, delays: np.ndarray, substeps: int, kind: Any) -> Shares:
+        """Compute shares.
+
+        Args:
+            delays: (n,) of n vehicles, integration steps, at least 0.
+            substeps: integration steps a period.
+            kind: type of a row of their states.
+        """
+        whole = np.floor(delays)
+        part, step = delays - whole, np.arange(substeps)[:, None]
+        # periods since the two controls that arrive in a step, (substeps, n)
+        later, earlier = (-((step - n) // substeps) for n in (whole, whole + 1))
+        newest, oldest = int(later.min()), int(earlier.max())
+        ages = np.arange(oldest, newest - 1, -1)[:, None]
+        weights = [
+            [
+                kind(row.tolist())
+                for row in (1 - part) * (ages == a) + part * (ages == b)
+            ]
+            for a, b in zip(later, earlier, strict=True)
+        ]
+        dr.make_opaque(weights)
+        return cls(oldest, newest, weights)

@@ -19,6 +19,7 @@ from mi_nerfattack.policy.inputs import Inputs
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import ClosedLoop
+from mi_nerfattack.rollout.variation import Variation, Varied
 from mi_nerfattack.vehicle import (
     RK4,
     AbstractDynamics,
@@ -34,7 +35,9 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 ROLLING = KinematicSingleTrack(4.0, 0.6, 3.0, 6.0, wheelbase=2.5)
 SLIPPING = DynamicSingleTrack(6.0)
-BOTH = {"rolling": ROLLING, "slipping": SLIPPING}
+#: Delays of less than a control period, and of more than three
+LATE = Varied(ROLLING, Variation(delay_s_sd=0.2, seed=8), 0.025)
+VEHICLES = {"rolling": ROLLING, "slipping": SLIPPING, "late": LATE}
 
 
 class TwoControls(analytic.AnalyticPolicy):
@@ -73,10 +76,12 @@ def gradient(rollout, poses):
         ("rolling", 5, False),
         ("rolling", 5, True),
         ("slipping", 3, False),
+        ("late", 3, False),
+        ("late", 0, True),
     ],
 )
 def test_attached_gradient_is_that_of_the_whole_loop(vehicle, delay, memory, rng):
-    loop = make_loop(BOTH[vehicle], delay, memory)
+    loop = make_loop(VEHICLES[vehicle], delay, memory)
     rollout, poses = Rollout(loop, Wave(), 8, attached=True), analytic.random_poses(2)
     start = loop.dynamics.extend(poses)
     found = rollout.gradient(rollout.run(to_state(start)))
@@ -136,8 +141,9 @@ def test_the_three_ways_back_agree(attached, memory):
         assert_close(other, first, 1e-12)
 
 
-def test_a_batch_is_its_drives_one_by_one():
-    loop, poses = make_loop(delay=2), analytic.random_poses(3)
+@pytest.mark.parametrize("vehicle", ["rolling", "late"])
+def test_a_batch_is_its_drives_one_by_one(vehicle):
+    loop, poses = make_loop(VEHICLES[vehicle], delay=2), analytic.random_poses(3)
     rollout = Rollout(loop, Wave(), 6, attached=True)
     whole = rollout.run(loop.initial(poses))
     controls = whole.trajectory.controls_numpy()
@@ -145,19 +151,21 @@ def test_a_batch_is_its_drives_one_by_one():
     derivative = rollout.gradient(whole)
     texture = np.zeros_like(derivative.textures[0].numpy())
     for number, pose in enumerate(poses):
-        one = rollout.run(loop.initial(pose))
+        alone = replace(rollout, loop=loop.numbered(number))
+        one = alone.run(loop.initial(pose))
         np.testing.assert_allclose(
             one.trajectory.controls_numpy()[0], controls[number], rtol=1e-10
         )
-        own = rollout.gradient(one)
+        own = alone.gradient(one)
         texture += own.textures[0].numpy() / 3
         by_start = np.array(derivative.initial)[:, number]
         np.testing.assert_allclose(np.array(own.initial)[:, 0] / 3, by_start, rtol=1e-8)
     np.testing.assert_allclose(derivative.textures[0].numpy(), texture, rtol=1e-8)
 
 
-def test_nothing_is_compiled_after_the_first_steps():
-    loop, poses = make_loop(delay=3), analytic.random_poses(2)
+@pytest.mark.parametrize("vehicle", ["rolling", "late"])
+def test_nothing_is_compiled_after_the_first_steps(vehicle):
+    loop, poses = make_loop(VEHICLES[vehicle], delay=3), analytic.random_poses(2)
     rollout = Rollout(loop, Wave(), 6, attached=True)
     gradient(rollout, poses)
     with nothing_compiled():

@@ -28,6 +28,7 @@ from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.objective import Worst
 from mi_nerfattack.rollout.sensor import Observation
 from mi_nerfattack.rollout.sweep import StepRecorder
+from mi_nerfattack.rollout.variation import Variation, Varied
 from mi_nerfattack.vehicle.dynamics import state_type, to_state
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -137,6 +138,21 @@ def test_adjoints_are_autograd(
     initial = loop.dynamics.extend(analytic.random_poses(3))
     options = {"adjoint": ADJOINTS[name], "attached": attached}
     check(loop, twin, initial, horizon, **options)
+
+
+@pytest.mark.parametrize("name", ADJOINTS)
+@pytest.mark.parametrize("attached", [True, False])
+@pytest.mark.parametrize(("substeps", "delay"), [(1, 0), (3, 4)])
+def test_each_drive_has_its_own_delay(substeps, delay, attached, name):
+    """Also of a part of a step, and of several control periods."""
+    loop, twin = analytic.make_pair("ackermann", "rk4", substeps, delay)
+    variation = Variation(delay_s_sd=0.2, seed=8)
+    more = variation.draws(0, 3).delay_s / loop.transition.dt
+    assert more.min() < substeps < more.max() / 2 and (more % 1).min() > 0.1
+    vehicle = Varied(loop.dynamics, variation, loop.transition.dt)
+    loop, twin.delay = replace(loop, dynamics=vehicle), delay + torch.tensor(more)
+    initial = loop.dynamics.extend(analytic.random_poses(3))
+    check(loop, twin, initial, 8, adjoint=ADJOINTS[name], attached=attached)
 
 
 class Rounded(torch.nn.Module):

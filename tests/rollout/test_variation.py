@@ -30,7 +30,7 @@ from mi_nerfattack.vehicle.single_track import KinematicSingleTrack
 pytestmark = pytest.mark.usefixtures("variant")
 
 ALL = Variation(
-    0.5, 0.4, 3.0, 0.2, 0.15, 0.25, steering_lag_s_sd=0.2, sun=SunRanges(), seed=4
+    0.5, 0.4, 3.0, 0.2, 0.15, 0.25, 0.2, delay_s_sd=0.1, sun=SunRanges(), seed=4
 )
 POSES = np.array([[0.0, 0.35, 0.02], [0.3, 0.2, -0.04], [-0.2, -0.1, 0.08]])
 
@@ -59,10 +59,13 @@ def test_draws_have_the_given_deviations_and_belong_to_a_drive():
     )
     # the mean size of a normal number is sqrt(2 / pi)
     assert drawn.lag_s.mean() == pytest.approx(0.2 * np.sqrt(2 / np.pi), rel=0.03)
+    assert drawn.delay_s.mean() == pytest.approx(0.1 * np.sqrt(2 / np.pi), rel=0.03)
+    assert abs(np.corrcoef(drawn.lag_s, drawn.delay_s)[0, 1]) < 0.03
     later = ALL.draws(2, 3)
     assert np.array_equal(later.light, drawn.light[:, 2:5])
     assert np.array_equal(later.speed, drawn.speed[2:5])
     assert np.array_equal(later.lag_s, drawn.lag_s[2:5])
+    assert np.array_equal(later.delay_s, drawn.delay_s[2:5])
 
 
 def test_suns_are_spread_over_their_ranges_and_belong_to_a_drive():

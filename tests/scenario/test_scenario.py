@@ -115,12 +115,12 @@ def test_keys_that_came_later_count_where_they_are_set(load, tmp_path):
     write_named_files(tmp_path)
     light = HEAD + "[attack.vary.sun]\nelevation_deg = [15, 60]\n"
     lag = HEAD + "[attack.vary]\nsteering_lag_s_sd = 0.1\n"
-    texts = HEAD, light, light.replace("60", "50"), lag
-    assert len({load(each)[0].digest() for each in texts}) == 4
+    delay = lag.replace("steering_lag_s_sd", "delay_s_sd")
+    texts = HEAD, light, light.replace("60", "50"), lag, delay
+    assert len({load(each)[0].digest() for each in texts}) == 5
     key = "scenario.attack.vary"
-    assert not {f"{key}.sun", f"{key}.steering_lag_s_sd"} & set(
-        load(HEAD)[0].identity()
-    )
+    later = {f"{key}.{name}" for name in ("sun", "steering_lag_s_sd", "delay_s_sd")}
+    assert not later & set(load(HEAD)[0].identity())
     scenario, _ = load(light)
     assert scenario.identity()[f"{key}.sun.elevation_deg"] == "[15.0, 60.0]"
     sun = scenario.attack.vary.sun

@@ -28,6 +28,7 @@ _TRIES = 32  # places of an object that are tried together,
 _LOOKED_AT = 8  # and of those that are free, looked at together
 _ROUNDS = 6
 _AHEAD_S = 4.0  # of driving, from a drive's end to the farthest objects
+_AFTER_S = 2.0  # of driving, from a patch to the drive's end: then its effect shows
 _ALONG = math.radians(4)  # long objects stand along the road, but for this,
 _BEND = math.radians(5)  # where it turns by less than this over their length
 
@@ -44,7 +45,8 @@ class Roadside:
     quarter of its width and of its height, faces the traffic on the route to 4 degrees
     instead: by the wider of its -x and -y sides. A patch, which is lower than a quarter
     of its length and of its width, lies on the lane of the route instead, where the
-    lane is as good as straight, +y along the lane to 4 degrees. Each is seen from a
+    lane is as good as straight, +y along the lane to 4 degrees, and the drive goes on
+    for 2 s after it, or for half of its length where it is short. Each is seen from a
     drive along the lane's centre: in frames of `view_s` together, not necessarily in a
     row, about `view_px` pixels or more show a part of it that neither the scene nor
     another object hides, as 64 of its points tell.
@@ -149,8 +151,11 @@ class Roadside:
     ) -> Stands:
         """Draw places beside the road, or on the lane; without ground, none."""
         scale = rng.uniform(*scales, _TRIES)
-        ahead = _AHEAD_S * route.speed_ms
-        arc = rng.uniform(stretch[0], stretch[1] + ahead, _TRIES)
+        begin, end = stretch
+        farthest = end + _AHEAD_S * route.speed_ms
+        if shape.is_patch:
+            farthest = max(end - _AFTER_S * route.speed_ms, (begin + end) / 2)
+        arc = rng.uniform(begin, farthest, _TRIES)
         side = rng.choice([-1.0, 1.0], _TRIES)
         gap = rng.uniform(*self.gap_m, _TRIES)
         turn = rng.uniform(-1, 1, _TRIES)

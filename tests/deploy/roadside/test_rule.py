@@ -215,7 +215,7 @@ def test_a_patch_lies_on_the_lane_along_it(route):
     around = surroundings(route)
     judge, patch = Judge(around, route, 38.0), FlatObject("patch", 1.8, 4.0).field()
     corners = np.array([[x, y, 0.0] for x in (-0.9, 0.9) for y in (-2.0, 2.0)])
-    lateral = []
+    lateral, arcs = [], []
     for seed in range(4):
         (pose,) = draw([patch], around, seed, route=route)
         projected = route.project_numpy(pose.apply(corners))
@@ -224,9 +224,12 @@ def test_a_patch_lies_on_the_lane_along_it(route):
         turn = pose.yaw + np.pi / 2 - route.heading_at(arc)[0]
         assert abs((turn + np.pi) % (2 * np.pi) - np.pi) <= np.radians(4.01)
         lateral.append(route.project_numpy(pose.translation * [1, 1, 0]).cross_track[0])
+        arcs.append(arc[0])
         assert judge.findings([patch], [pose]) == []
         assert judge.seconds([patch], [pose], 10).min() >= 0.95
     assert np.ptp(lateral) > 0.2
+    # the drive goes on for 2 s after it
+    assert DRIVE[0] <= min(arcs) and max(arcs) <= DRIVE[1] - 2 * route.speed_ms
 
 
 @pytest.mark.parametrize(

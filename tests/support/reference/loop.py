@@ -168,8 +168,9 @@ class TorchLoop:
     """The loop in plain PyTorch: a graph through all of time.
 
     Vehicle and integrator are keys of `VEHICLES` and `INTEGRATORS`; the module maps
-    images and goals to controls; substeps and delay are those of `ClosedLoop`. States
-    and images are those of the last drive, with their graph.
+    images and goals to controls; substeps and delay are those of `ClosedLoop`, the
+    delay a number or one for each vehicle. States and images are those of the last
+    drive, with their graph.
     """
 
     vehicle: str
@@ -178,7 +179,7 @@ class TorchLoop:
     goal: int
     dt: float
     substeps: int = 1
-    delay: int = 0
+    delay: float | torch.Tensor = 0
     states: list[torch.Tensor] = field(default_factory=list)
     images: list[torch.Tensor] = field(default_factory=list)
 
@@ -193,20 +194,29 @@ class TorchLoop:
         """Return states (n, horizon + 1, m) and raw controls (n, horizon)."""
         states, controls, state, steps = [initial], [], initial, 0
         goals = torch.full((len(initial),), self.goal)
-        none, self.images = torch.zeros_like(initial[:, 0]), []
+        self.images = []
         for period in range(horizon):
             seen = state if attached else state.detach()
             image = torch_image(seen, period, textures, offsets)
             self.images.append(image)
             controls.append(self.module(image.permute(0, 3, 1, 2), goals))
             for _ in range(self.substeps):
-                source = (steps - self.delay) // self.substeps
-                command = controls[source] if source >= 0 else none
+                command = self._command(controls, steps)
                 state = self._advance(state, limited(self.vehicle, command))
                 steps += 1
             states.append(state)
         self.states = states
         return torch.stack(states, 1), torch.stack(controls, 1)
+
+    def _command(self, controls: list[torch.Tensor], step: int) -> torch.Tensor:
+        """Return the mean of what arrives in an integration step, (n,)."""
+        start = step - torch.as_tensor(self.delay, dtype=torch.float64)
+        command = torch.zeros_like(controls[0])
+        for period, control in enumerate(controls):
+            held = period * self.substeps, (period + 1) * self.substeps
+            overlap = (start + 1).clamp(max=held[1]) - start.clamp(min=held[0])
+            command = command + overlap.clamp(min=0) * control
+        return command
 
     def _advance(self, x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
         h, f = self.dt / self.substeps, TORCH_VEHICLES[self.vehicle]

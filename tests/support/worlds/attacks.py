@@ -38,6 +38,7 @@ vary.height_sd = 0.1
 vary.speed_sd = 0.1
 vary.steering_sd = 0.1
 vary.steering_lag_s_sd = 0.1
+vary.delay_s_sd = 0.1
 """
 
 

@@ -1,0 +1,129 @@
+"""``python -m bench reach``: how far objects can move the control, at each place."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+
+from bench.results import progress, publish
+from bench.tables import markdown, number
+from mi_nerfattack import variant
+from mi_nerfattack.commands.shared.options import Settings
+from mi_nerfattack.commands.shared.terminal import Result
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.checks.reach import DRIVES, Reach, measure_reach
+from mi_nerfattack.experiment.sweep.grid import load_cells
+from mi_nerfattack.io import files
+from mi_nerfattack.io.strict import parse_toml
+from mi_nerfattack.rollout.drive import departure_limit
+from mi_nerfattack.scenario.scenario import Scenario, load_scenario
+from mi_nerfattack.scenario.world import World, build_world
+
+#: Columns of the table, by the keys of a row.
+HEADS = {
+    "place": "place",
+    "in_view": "frames in view",
+    "pixels": "pixels",
+    "most_pixels": "most",
+    "moved": "reach",
+    "most_moved": "most",
+    **{f"{name}_m": f"{name}, m" for name in DRIVES},
+    "limit_m": "limit, m",
+}
+
+
+@dataclass(frozen=True)
+class BenchReach:
+    """Measure how far the objects can move the control, whatever they look like.
+
+    In each frame, each pixel of the objects takes the value that moves the first
+    control most: no texture moves it farther. The table has, at each place, the frames
+    in which the objects change pixels by 0.1 or more, the pixels and the reach of
+    these frames (median and most, in the unit of the control), and the largest error
+    of three drives from the nominal start: as the objects look, and with all frames'
+    controls raised or lowered. A place takes a minute.
+    """
+
+    file: tyro.conf.Positional[Path]
+    """Scenario or grid file (TOML). Of a grid, each place is measured once."""
+    only: tuple[str, ...] = ()
+    """Places of a grid, as the table names them: right-patch-1. All by default."""
+    settings: Settings = ()
+    """Set a key of the scenario: drive.length_m=45. A grid sets keys itself."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Also write the result with machine, versions and date (.json, or a folder)."""
+    json: bool = False
+    """Print one line of JSON in place of the table."""
+
+    def run(self) -> Result:
+        """Measure each place, and print the table."""
+        variant.ensure()
+        rows = []
+        with progress() as show:
+            for place, scenario in self._scenarios():
+                world = build_world(scenario, scenario.build_policy())
+                on_step = partial(_shown, show, place, world.horizon)
+                rows.append(
+                    {
+                        "place": place,
+                        **row(world, measure_reach(world, on_step=on_step)),
+                    }
+                )
+                del world
+                gc.collect()
+        document = publish("reach", self, {"places": rows})
+        return Result(document, lambda: print(table(rows)))
+
+    def _scenarios(self) -> Iterator[tuple[str, Scenario]]:
+        if "scenario" not in files.read_toml(self.file):
+            yield self.file.stem, load_scenario(self.file, settings=self.settings)[0]
+            return
+        if self.settings:
+            raise InputError(f"--set: {self.file} is a grid; set the key in it")
+        cells = {f"{c.route}-{c.objects}-{c.seed}": c for c in load_cells(self.file)}
+        if unknown := sorted({*self.only} - {*cells}):
+            raise InputError(f"--only: {unknown[0]!r}; places: {', '.join(cells)}")
+        for place in self.only or cells:
+            text = cells[place].text
+            yield place, Scenario.model_validate(parse_toml(self.file, text))
+
+
+def _shown(show: Any, place: str, horizon: int, step: int) -> None:
+    show(place, step + 1, horizon, "")
+
+
+def row(world: World, reach: Reach) -> dict[str, Any]:
+    """Return the figures of a place."""
+    seen = reach.pixels > 0
+    farthest = np.abs(reach.cross_track_m).max(1)
+    width = world.scenario.vehicle.width_m
+    middle = {"pixels": 0.0, "moved": 0.0}
+    if seen.any():
+        middle["pixels"] = float(np.median(reach.pixels[seen]))
+        middle["moved"] = float(np.median(reach.moved[seen]))
+    return {
+        "frames": len(seen),
+        "in_view": int(seen.sum()),
+        "most_pixels": int(reach.pixels.max()),
+        "most_moved": float(reach.moved.max()),
+        **middle,
+        **{f"{name}_m": float(m) for name, m in zip(DRIVES, farthest, strict=True)},
+        "limit_m": departure_limit(world.route.lane_width_m, width),
+    }
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Return the table in Markdown."""
+    cells = []
+    for item in rows:
+        told = {k: v if isinstance(v, str) else number(v) for k, v in item.items()}
+        told["in_view"] = f"{item['in_view']} of {item['frames']}"
+        cells.append([told[key] for key in HEADS])
+    return markdown(list(HEADS.values()), cells)
