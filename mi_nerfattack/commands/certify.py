@@ -109,7 +109,7 @@ class CertifyGradient:
     Changes the attack's parameters a little in random directions and along the
     gradient, to both sides. Prints the slope of the real change by the predicted one,
     the cosine between gradient and differences, and up to which horizon the gradient
-    predicts. Ends with 0, or with 1 if it does not predict the whole drive.
+    predicts.
     """
 
     continues: ClassVar[bool] = True
@@ -121,8 +121,9 @@ class CertifyGradient:
     certificate goes on."""
     directions: int = 32
     """Random directions; along the gradient comes another one."""
-    step: float = 0.02
-    """Standard deviation of a random change, sRGB values of 1."""
+    step: float = 0.1
+    """Standard deviation of the random changes of raw colours, before the sigmoid; of
+    poses, as a share of their learning rate."""
     workers: int | None = None
     """Processes that drive; by default one per core, 1 for a policy behind a URL."""
     json: bool = False
@@ -130,4 +131,32 @@ class CertifyGradient:
 
     def run(self) -> Result:
         """Drive, compare, write and print."""
-        raise NotImplementedError
+        from mi_nerfattack import variant
+        from mi_nerfattack.commands.shared.progress import StageBars
+        from mi_nerfattack.experiment.certify.gradient import (
+            certify_gradient,
+            sentences,
+        )
+        from mi_nerfattack.io import files
+        from mi_nerfattack.report.certificate import gradient_table
+        from mi_nerfattack.system.workers import chosen_workers
+
+        files.check_folder(self.output)
+        variant.ensure()
+        workers = chosen_workers(self.workers, alone=False)
+        with StageBars() as bars:
+
+            def show(stage: str, done: int, total: int) -> None:
+                bars.show(stage, done, total, f"{done}/{total}")
+
+            how = self.directions, self.step, workers, show
+            document = certify_gradient(self.run_folder, self.output, *how)
+
+        def tell() -> None:
+            out = console()
+            out.print(gradient_table(document))
+            for line in sentences(document):
+                out.print(line, highlight=False)
+            out.print(f"Written: {self.output.resolve()}", soft_wrap=True)
+
+        return Result(document, tell)

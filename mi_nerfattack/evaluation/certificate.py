@@ -1,4 +1,4 @@
-"""The mathematics of both certificates: exact intervals, and bounds by smoothing.
+"""The mathematics of both certificates: bounds by smoothing, truth of gradients.
 
 A drive departs or it does not. Let z be coefficients of a texture, and let h(z) be the
 chance that a drive past the texture departs. The *smoothed* chance at z is the mean of
@@ -15,6 +15,10 @@ Clopper and Pearson, Biometrika 1934.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
 
 
 def chance_interval(count: int, total: int, confidence: float) -> tuple[float, float]:
@@ -50,3 +54,58 @@ def bound_within(chance: float, radius: float, sd: float) -> float:
     import scipy.stats  # it takes a second
 
     return float(scipy.stats.norm.cdf(scipy.stats.norm.ppf(chance) + radius / sd))
+
+
+#: A gradient is true where the lower end of the cosine's interval and the slope are so.
+LEAST_COSINE, SLOPES = 0.5, (0.5, 2.0)
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How predicted changes of an objective agree with real ones.
+
+    For normal directions of equal standard deviation, the slope goes to ``<g, p> /
+    <p, p>`` and the cosine to that between g and p, where g is the gradient of the
+    real objective and p the gradient that predicts.
+
+    Attributes:
+        slope: least squares of real by predicted changes, through zero.
+        slope_ci95: Student's interval.
+        cosine: between both.
+        cosine_ci95: by Fisher's transformation.
+    """
+
+    slope: float
+    slope_ci95: tuple[float, float]
+    cosine: float
+    cosine_ci95: tuple[float, float]
+
+    @property
+    def is_true(self) -> bool:
+        """Whether a step along the gradient does about what the gradient says."""
+        low, high = SLOPES
+        return self.cosine_ci95[0] >= LEAST_COSINE and low <= self.slope <= high
+
+
+def agreement(predicted: np.ndarray, real: np.ndarray) -> Agreement | None:
+    """Compare changes (n,) of an objective along n random directions, n at least 3.
+
+    Returns:
+        None where all changes of one kind are zero.
+
+    Source: Fisher, Metron 1921; n less 2, because both means are known to be zero.
+    """
+    import scipy.stats  # it takes a second
+
+    n, square = len(real), float(predicted @ predicted)
+    if n < 3 or not square or not real.any():
+        return None
+    slope = float(predicted @ real) / square
+    rest = real - slope * predicted
+    error = float(np.sqrt(rest @ rest / (n - 1) / square))
+    reach = float(scipy.stats.t.ppf(0.975, n - 1)) * error
+    cosine = float(predicted @ real) / float(np.sqrt(square * (real @ real)))
+    at = np.arctanh(np.clip(cosine, -1 + 1e-12, 1 - 1e-12))
+    width = float(scipy.stats.norm.ppf(0.975)) / np.sqrt(n - 2)
+    ends = float(np.tanh(at - width)), float(np.tanh(at + width))
+    return Agreement(slope, (slope - reach, slope + reach), cosine, ends)

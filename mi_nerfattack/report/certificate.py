@@ -37,3 +37,24 @@ def robustness_table(document: Mapping[str, Any]) -> Table:
     )
     label = Column("radius", "radius")
     return Table(title, [label], figures, [centre, *document["rows"]])
+
+
+def gradient_table(document: Mapping[str, Any]) -> Table:
+    """Return slope and cosine for each horizon."""
+    figures = [
+        Column("slope", "slope"),
+        Column("95 % of the slope", "slope_ci95", short="95 %"),
+        Column("cosine", "cosine"),
+        Column("95 % of the cosine", "cosine_ci95", short="95 %"),
+        Column("along the gradient", _along, short="along"),
+        Column("true", lambda row: "yes" if row["is_true"] else "no"),
+    ]
+    title = f"Real by predicted changes along {document['directions']} directions"
+    label = Column("horizon (s)", lambda row: f"{row['time_s']:g}")
+    return Table(title, [label], figures, document["rows"])
+
+
+def _along(row: Mapping[str, Any]) -> float | None:
+    """Return the real change along the gradient in units of the predicted one."""
+    predicted = row["along_predicted"]
+    return row["along_real"] / predicted if predicted else None

@@ -215,7 +215,7 @@ def certify_robustness(
             such environment, or another process works in the folder.
     """
     with locks.claimed(output):
-        _check_folder(output)
+        check_folder(output, DRIVES, DRIVES_TABLE)
         locks.remove_partial(output)
         world = build_world(scenario, scenario.build_policy())
         looks = Looks(world, settings.coefficients)
@@ -243,20 +243,27 @@ def certify_robustness(
             "chance_interval": [*chance_interval(departed, len(centre), confidence)],
             "chance_bound": bound,
             "drive_s": float(np.median([item.wall_s for item in centre])),
-            "rows": [job.row(radius, bound, *found) for radius, *found in radii],
+            "rows": [
+                job.row(radius, bound, point, found) for radius, point, found in radii
+            ],
         }
         _write(output, document, job, centre, attacked)
     return document
 
 
-def _check_folder(output: Path) -> None:
-    """Refuse a folder that holds something else."""
-    own = {DRIVES, DRIVES_TABLE, DOCUMENT, TABLE, PICTURE}
+def check_folder(output: Path, *names: str) -> None:
+    """Refuse a folder that holds something else than a certificate.
+
+    Args:
+        output: the folder.
+        names: of files and folders that only this kind of certificate has.
+    """
+    own = {*names, DOCUMENT, TABLE, PICTURE}
     own |= {str(Path(PICTURE).with_suffix(suffix)) for suffix in (".pdf", ".svg")}
     others = {p.name for p in output.iterdir() if not locks.is_partial(p)} - own
     if others:
         raise InputError(
-            f"{output}: holds something else than a certificate, such as "
+            f"{output}: holds something else than such a certificate, for example "
             f"{min(others)}; choose another folder"
         )
 

@@ -52,3 +52,36 @@ def plot_robustness(path: str | Path, document: Mapping[str, Any]) -> None:
         )
         axis.grid(alpha=0.25)
         axis.legend(frameon=False)
+
+
+def plot_gradient(path: str | Path, document: Mapping[str, Any]) -> None:
+    """Draw slope and cosine by horizon, and real changes against predicted ones.
+
+    Args:
+        path: PNG file.
+        document: of `certify_gradient`.
+    """
+    rows = [row for row in document["rows"] if "slope" in row]
+    time_s = np.array([row["time_s"] for row in rows])
+    with chart(path, 3.9) as figure:
+        left, right = figure.subplots(1, 2)
+        for name, colour, shift in (("slope", BLUE, -1), ("cosine", ORANGE, 1)):
+            values = np.array([row[name] for row in rows])
+            ends = np.array([row[f"{name}_ci95"] for row in rows]).reshape(-1, 2)
+            errors = np.abs(ends.T - values)
+            at = time_s + shift * 0.006 * document["rows"][-1]["time_s"]
+            left.errorbar(at, values, errors, fmt="o-", color=colour, label=name)
+        left.axhline(1, color=GREY, linewidth=0.8)
+        left.axhline(0, color=GREY, linewidth=0.8)
+        left.set_xlabel("horizon (s)")
+        left.set_title("1: the gradient tells the truth", fontsize=9)
+        left.legend(frameon=False)
+        last = document["rows"][-1]
+        right.plot(last["predicted"], last["real"], "o", color=BLUE, markersize=3)
+        along = [last["along_predicted"]], [last["along_real"]]
+        right.plot(*along, "*", color=ORANGE, markersize=9, label="along the gradient")
+        right.axline((0, 0), slope=1, color=GREY, linewidth=0.8)
+        right.set_xlabel("predicted change of the objective")
+        right.set_ylabel("real change")
+        right.set_title(f"the whole drive of {last['time_s']:g} s", fontsize=9)
+        right.legend(frameon=False)
