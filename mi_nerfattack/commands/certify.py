@@ -34,7 +34,7 @@ class CertifyRobustness:
     """Set a key of the scenario: seed=1, drive.lateral_sd_m=0.2."""
     environment: str = "surrogate"
     """Environment of the scenario."""
-    drives: int = 1000
+    runs: int = 1000
     """Drives under noise, which the bound follows from."""
     sd: float = 0.5
     """Standard deviation of the noise in each coefficient, sRGB values of 1."""
@@ -72,7 +72,7 @@ class CertifyRobustness:
         files.check_folder(self.output)
         settings = RobustnessSettings(
             environment=self.environment,
-            drives=self.drives,
+            drives=self.runs,
             sd=self.sd,
             radii=self.radii,
             coefficients=self.coefficients,

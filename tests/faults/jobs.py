@@ -70,7 +70,7 @@ JOBS = {
     ),
     "certify robustness": Job(
         "certify robustness scenario.toml",
-        "-o bounded --drives 3 --radii 0.5 --proposals 2 --judged-by 1 --attacked 1",
+        "-o bounded --runs 3 --radii 0.5 --proposals 2 --judged-by 1 --attacked 1",
         "scenario",
         ("bounded/certificate.csv", _drives("bounded")),
         _drives("bounded"),
