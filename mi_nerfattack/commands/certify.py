@@ -72,7 +72,7 @@ class CertifyRobustness:
         files.check_folder(self.output)
         settings = RobustnessSettings(
             environment=self.environment,
-            drives=self.runs,
+            runs=self.runs,
             sd=self.sd,
             radii=self.radii,
             coefficients=self.coefficients,
@@ -149,8 +149,14 @@ class CertifyGradient:
             def show(stage: str, done: int, total: int) -> None:
                 bars.show(stage, done, total, f"{done}/{total}")
 
-            how = self.directions, self.step, workers, show
-            document = certify_gradient(self.run_folder, self.output, *how)
+            document = certify_gradient(
+                self.run_folder,
+                self.output,
+                directions=self.directions,
+                step=self.step,
+                workers=workers,
+                on_stage=show,
+            )
 
         def tell() -> None:
             out = console()

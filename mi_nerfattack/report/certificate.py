@@ -16,7 +16,7 @@ def robustness_table(document: Mapping[str, Any]) -> Table:
         "radius": 0.0,
         "bound": document["chance_bound"],
         "attack_departed": document["departed"],
-        "attack_drives": settings["drives"],
+        "attack_drives": settings["runs"],
         "attack_chance": document["chance"],
         "attack_interval": document["chance_interval"],
         "gap": document["chance_bound"] - document["chance"],

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from mi_nerfattack.backend.determinism import one_thread
+from mi_nerfattack.backend.determinism import deterministic, one_thread
 from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.drives.spec import short_digest
 from mi_nerfattack.drives.table import write_csv
@@ -78,7 +78,7 @@ class Differences(AbstractWork):
 
     def do(self, opened: Ended, index: int, report: OnUnits) -> None:
         """Predict and drive to both sides; a unit is a direction."""
-        with one_thread():
+        with one_thread(), deterministic(self.scenario.attack.deterministic):
             gradients = self.gradients(opened)
             random = index < self.directions
             drawn = opened.drawn(index) if random else opened.downhill(gradients[-1])
@@ -173,11 +173,18 @@ def certify_gradient(
         ended = Ended.of(run, scenario)
         identity = {**versions(), **scenario.identity(), "step": f"{step}"}
         identity["best"] = ended.digest
-        folder, count = output / DIFFERENCES, directions + 1
-        how = identity, directions, step, ended
-        work = Differences(folder, run, scenario, *how)
+        count = directions + 1
+        work = Differences(
+            folder=output / DIFFERENCES,
+            run=run,
+            scenario=scenario,
+            identity=identity,
+            directions=directions,
+            step=step,
+            here=ended,
+        )
         on_stage("differentiating", 0, 1)
-        with one_thread():
+        with one_thread(), deterministic(scenario.attack.deterministic):
             work.gradients(ended)
         on_stage("differentiating", 1, 1)
         left = [index for index in range(count) if work.read(index) is None]

@@ -107,23 +107,30 @@ class Smoothing:
         Raises:
             InputError: there is no such environment, or it does not close the loop.
         """
-        scenario, content = world.scenario, section_content
+        scenario = world.scenario
         if label not in world.labels or world.is_open_loop(label):
             closed = [name for name in world.labels if not world.is_open_loop(name)]
             raise InputError(f"--environment: {label!r}; one of {', '.join(closed)}")
         identity = shared_identity(world, scenario.identity(), label)
-        identity |= flatten("freedom", content(scenario.attack.freedom))
+        identity |= flatten("freedom", section_content(scenario.attack.freedom))
         identity["coefficients"] = f"{looks.count}"
-        name, steps = world.route.name, world.horizon
-        return cls(scenario, label, name, steps, identity, looks.count, sd)
+        return cls(
+            scenario=scenario,
+            label=label,
+            route=world.route.name,
+            steps=world.horizon,
+            identity=identity,
+            count=looks.count,
+            sd=sd,
+        )
 
     def draw(self, world: World, purpose: str, number: int) -> Draw:
         """Draw what is random in a drive; the same for all coefficients."""
         stream = _STREAMS[purpose]
         rng = np.random.default_rng([self.scenario.seed, stream, number])
         noise = self.sd * rng.standard_normal(self.count)
-        # streams of the starts of attacks and of their drives are below 2^32
-        own = (stream << 32) + number
+        # 2^40: a stream of words that neither attacks nor the noise begin with
+        own = (1 << 40) + (stream << 32) + number
         [start] = initial_states(self.scenario, world.route, 1, own)
         return Draw(noise, start, int(rng.integers(2**31)))
 

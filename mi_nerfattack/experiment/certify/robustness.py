@@ -56,7 +56,7 @@ class RobustnessSettings:
 
     Args:
         environment: label of the scenario's.
-        drives: n, under noise around the original textures.
+        runs: drives under noise around the original textures.
         sd: standard deviation of the noise, sRGB values.
         radii: within which textures may change; Euclidean, of the coefficients.
         coefficients: of all objects together, at most.
@@ -70,7 +70,7 @@ class RobustnessSettings:
     """
 
     environment: str = SURROGATE
-    drives: Count = 1000
+    runs: Count = 1000
     sd: Positive = 0.5
     radii: tuple[Positive, ...] = (0.25, 0.5, 1.0)
     coefficients: Count = 24
@@ -114,7 +114,7 @@ class _Job:
     def centre(self) -> tuple[list[Finished], np.ndarray]:
         """Drive around the original textures; return the direction of severity, too."""
         smoothing, zero = self.smoothing, np.zeros(self.smoothing.count)
-        numbers = range(self.settings.drives)
+        numbers = range(self.settings.runs)
         draws = [smoothing.draw(self.world, CENTRE, k) for k in numbers]
         specs = [smoothing.spec(zero, draw, RANDOM, k) for k, draw in enumerate(draws)]
         found = self.drive("driving under noise", specs)

@@ -51,7 +51,7 @@ def plot_robustness(path: str | Path, document: Mapping[str, Any]) -> None:
             f"{sd:g} in each of {document['coefficients']} coefficients"
         )
         axis.grid(alpha=0.25)
-        axis.legend(frameon=False)
+        axis.legend(frameon=False, loc="upper left")
 
 
 def plot_gradient(path: str | Path, document: Mapping[str, Any]) -> None:

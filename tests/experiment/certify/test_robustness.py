@@ -36,7 +36,7 @@ from tests.experiment.conftest import write_found
 pytestmark = pytest.mark.usefixtures("variant")
 
 SETTINGS = RobustnessSettings(
-    drives=12, sd=0.5, radii=(0.3, 1.0), proposals=3, judged_by=2, attacked=4
+    runs=12, sd=0.5, radii=(0.3, 1.0), proposals=3, judged_by=2, attacked=4
 )
 
 
@@ -123,7 +123,7 @@ def test_finished_drives_are_kept_and_more_are_added(scenario, certified):
     again = certify_robustness(scenario, output, SETTINGS, InThisProcess())
     assert again == document
     assert {p: p.stat().st_mtime_ns for p in output.rglob("*.safetensors")} == before
-    more = RobustnessSettings(**{**vars(SETTINGS), "drives": 14, "radii": (0.3,)})
+    more = RobustnessSettings(**{**vars(SETTINGS), "runs": 14, "radii": (0.3,)})
     wider = certify_robustness(scenario, output, more, InThisProcess())
     kept = {p: p.stat().st_mtime_ns for p in output.rglob("random_*.safetensors")}
     assert len(kept) == 14 and sum(before.get(p) == at for p, at in kept.items()) == 12
