@@ -257,8 +257,8 @@ def _flags(document: Mapping[str, Any]) -> list[str]:
             "follow the vehicle"
         )
     return [
-        f"the gradient predicts the objective {where}: beyond, the cosine may be below "
-        f"{LEAST_COSINE:g} or the slope is outside of {low:g} to {high:g}{why}"
+        f"the gradient predicts the objective {where}; elsewhere its cosine may be "
+        f"below {LEAST_COSINE:g}, or its slope is not from {low:g} to {high:g}{why}"
     ]
 
 
