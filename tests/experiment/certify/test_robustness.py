@@ -79,7 +79,7 @@ def scenario(tmp_path_factory):
     mi.set_variant("llvm_ad_rgb")
     path = write_found(tmp_path_factory.mktemp("scenario"))
     # the lane is hardly wider than the car: some drives depart, and some do not
-    narrow = "[vehicle]\nwidth_m = 3.4\n[drive]"
+    narrow = "[vehicle]\nwidth_m = 3.3\n[drive]"
     path.write_text(path.read_text().replace("[drive]", narrow))
     return load_scenario(path)[0]
 
