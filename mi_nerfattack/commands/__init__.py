@@ -22,6 +22,7 @@ from mi_nerfattack.commands.capture import (
     CaptureScene,
     CaptureVideo,
 )
+from mi_nerfattack.commands.certify import CertifyGradient, CertifyRobustness
 from mi_nerfattack.commands.check import Check
 from mi_nerfattack.commands.compare_drives import CompareDrives
 from mi_nerfattack.commands.compare_field import CompareField
@@ -123,6 +124,10 @@ _EXPORT = Group(
         "screen": ExportScreen,
     },
 )
+_CERTIFY = Group(
+    "Bound the chance of a departure; compare an attack's gradient to differences.",
+    {"robustness": CertifyRobustness, "gradient": CertifyGradient},
+)
 #: What can be called, by theme.
 THEMES: dict[str, Commands] = {
     "start": {"doctor": Doctor, "demo": Demo},
@@ -134,6 +139,7 @@ THEMES: dict[str, Commands] = {
         "attack": Attack,
         "sweep": Sweep,
         "transfer": Transfer,
+        "certify": _CERTIFY,
         "reproduce": Reproduce,
         "upgrade": Upgrade,
     },

@@ -85,33 +85,39 @@ def step_counter(
 
 
 @dataclass(frozen=True, eq=False)
-class _Shown:
+class Shown:
     """What a drive shows, and from where it starts.
 
     Attributes:
         start: (3,) pose.
-        look: of all objects, or the number of a random look; None without.
+        look: appearance of all objects, or of what the driver makes one; None without
+            objects.
         digest: of the look.
     """
 
     start: np.ndarray
-    look: Appearance | int | None
+    look: Any
     digest: str
 
 
 class CaseDriver(AbstractDriver):
-    """Drives in a world, whose objects show what each drive asks for."""
+    """Drives in a world, whose objects show what each drive asks for.
 
-    def __init__(self, world: World, own: Appearance) -> None:
+    Args:
+        world: to drive in.
+        looks: makes an appearance of a look that is none.
+    """
+
+    def __init__(self, world: World, looks: Callable[[Any], Appearance]) -> None:
         super().__init__()
-        self._world, self._random = world, RandomAppearances.of(world, own)
+        self._world, self._looks = world, looks
 
     def drive(self, spec: DriveSpec, on_step: OnStep) -> Drive:
         """Drive once."""
         world, shown, label = self._world, spec.how, spec.environment
         look, empty = shown.look, shown.look is None
         if not empty:
-            world.show(self._random(look) if isinstance(look, int) else look)
+            world.show(look if isinstance(look, Appearance) else self._looks(look))
         key = label, empty, shown.digest if world.builds_in(label) else None
         with deterministic(world.scenario.attack.deterministic):
             return drive(
@@ -155,7 +161,7 @@ class CaseDrives(AbstractDrives):
         world = self.world
         if world is None:
             world = build_world(self.scenario, self.scenario.build_policy())
-        return CaseDriver(world, self.own)
+        return CaseDriver(world, RandomAppearances.of(world, self.own))
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the world behind, which no process can send."""
@@ -211,7 +217,8 @@ class Cases:
         if (kept := self.store.read(spec)) is not None:
             return kept.drive
         if self._driver is None:
-            self._driver = CaseDriver(self.world, self.own)
+            looks = RandomAppearances.of(self.world, self.own)
+            self._driver = CaseDriver(self.world, looks)
         on_step = step_counter(self.on_progress, f"{label}: {case}", spec.steps)
         count = self.counter()
         found = self._work([spec]).drive(self._driver, spec, on_step)
@@ -283,7 +290,7 @@ class Cases:
             seed=seed,
             steps=world.horizon,
             identity=self._shared(label) | flatten("drive", decided),
-            how=_Shown(start, look, digest),
+            how=Shown(start, look, digest),
         )
 
     def _digest(self, look: Appearance | int) -> str:
@@ -296,12 +303,25 @@ class Cases:
     def _shared(self, label: str) -> dict[str, str]:
         """Return what all drives in an environment have in common."""
         if label not in self._identities:
-            scenario, here = self.world.scenario, label == SURROGATE
-            name, section = None, {}
-            if not here:
-                name = self.world.deployments[label].environment
-                section = section_content(dict(labelled(scenario.deployment))[label])
-            found = decisive(scenario, self.identity, here)
-            found |= flatten("deployment", section)
-            self._identities[label] = identify(name, found)
+            self._identities[label] = shared_identity(self.world, self.identity, label)
         return self._identities[label]
+
+
+def shared_identity(
+    world: World, identity: Mapping[str, str], label: str
+) -> dict[str, str]:
+    """Return what decides about all drives in an environment.
+
+    Not what objects show, where a drive starts, and its seed.
+
+    Args:
+        world: of the drives.
+        identity: of its scenario, see :meth:`Scenario.identity`.
+        label: of the environment.
+    """
+    name, section, here = None, {}, label == SURROGATE
+    if not here:
+        name = world.deployments[label].environment
+        section = section_content(dict(labelled(world.scenario.deployment))[label])
+    found = decisive(world.scenario, identity, here)
+    return identify(name, found | flatten("deployment", section))

@@ -33,9 +33,8 @@ INPUT = "takes files of the user's, or a folder that minutes to hours of work ma
 LONG = "takes more than a minute"
 USAGE = "shows what may be given, in words that stand for it"
 SKIPPED = {
-    **dict.fromkeys(
-        "README bench index policy refine room training your_policy".split(), LONG
-    ),
+    **dict.fromkeys("README bench certify index policy".split(), LONG),
+    **dict.fromkeys("refine room training your_policy".split(), LONG),
     **dict.fromkeys("attack sweep".split(), USAGE),
     **dict.fromkeys("examples fields place render report".split(), INPUT),
     **dict.fromkeys("retrain transfer view".split(), INPUT),

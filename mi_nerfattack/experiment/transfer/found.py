@@ -156,7 +156,7 @@ def _read(folder: Path, label: str) -> FoundAttack:
     document = read_finished(folder)
     scenario, _ = load_scenario(folder / SCENARIO)
     identity = scenario.identity()
-    _check_unchanged(folder / CHECKPOINT, identity)
+    check_unchanged(folder / CHECKPOINT, identity)
     offsets = np.zeros((len(scenario.objects), 6))
     for number, item in enumerate(scenario.objects):
         pose = (document.get("object_poses") or {}).get(item.id)
@@ -180,8 +180,8 @@ def _digest(folder: Path, scenario: Scenario, offsets: np.ndarray) -> str:
     return json_digest([sums, offsets.tolist()])
 
 
-def _check_unchanged(checkpoint: Path, identity: Mapping[str, str]) -> None:
-    """Compare the scenario with what the run was made with."""
+def check_unchanged(checkpoint: Path, identity: Mapping[str, str]) -> None:
+    """Raise InputError if a scenario, or a file of it, has changed since its run."""
     if not checkpoint.is_file():  # it takes much room, and may have been removed
         return
     _, metadata = files.read_safetensors(checkpoint, ())

@@ -1,0 +1,1 @@
+"""Certificates: bounds on departures under changed textures, truth of gradients."""
