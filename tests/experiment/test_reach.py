@@ -94,7 +94,7 @@ def world(path) -> World:
     return build_world(scenario, scenario.build_policy())
 
 
-def first_controls(world: World, colours: list[float]) -> list[np.ndarray]:
+def first_images(world: World, colours: list[float]) -> list[np.ndarray]:
     """Return the first image with the object in each of some grey colours."""
     sensor, images = world.optimised, []
     assert isinstance(sensor, AbstractDifferentiableSensor)
@@ -115,7 +115,7 @@ def test_objects_reach_what_their_pixels_allow(world):
     before = world.appearance().digest
     reach = measure_reach(world)
     assert world.appearance().digest == before
-    low, high = first_controls(world, [MARGIN, 1 - MARGIN])
+    low, high = first_images(world, [MARGIN, 1 - MARGIN])
     weight = toy.SmoothPolicy().weight.detach().numpy().transpose(0, 2, 3, 1)
     steered = np.stack([weight, -weight])
     farthest = np.maximum(steered * (high - 0.4), steered * (low - 0.4))
