@@ -74,7 +74,7 @@ def plot_gradient(path: str | Path, document: Mapping[str, Any]) -> None:
         left.axhline(1, color=GREY, linewidth=0.8)
         left.axhline(0, color=GREY, linewidth=0.8)
         left.set_xlabel("horizon (s)")
-        left.set_title("1: the gradient tells the truth", fontsize=9)
+        left.set_title("1: the prediction is right", fontsize=9)
         left.legend(frameon=False)
         last = document["rows"][-1]
         right.plot(last["predicted"], last["real"], "o", color=BLUE, markersize=3)
