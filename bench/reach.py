@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import pandas as pd
 import tyro
 
-from bench.results import progress, publish
+from bench.results import progress
 from bench.tables import markdown, number
 from mi_nerfattack import variant
 from mi_nerfattack.commands.shared.options import Settings
@@ -58,28 +59,33 @@ class BenchReach:
     settings: Settings = ()
     """Set a key of the scenario: drive.length_m=45. A grid sets keys itself."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Also write the result with machine, versions and date (.json, or a folder)."""
+    """Table (.csv), which a second run continues: places that it has are not measured
+    again."""
     json: bool = False
     """Print one line of JSON in place of the table."""
 
     def run(self) -> Result:
-        """Measure each place, and print the table."""
+        """Measure each place that has no row yet, and print the table."""
         variant.ensure()
         rows = []
+        if self.output is not None:
+            files.make_folder(self.output.parent)
+            if self.output.exists():
+                rows = pd.read_csv(self.output).to_dict("records")
         with progress() as show:
             for place, scenario in self._scenarios():
+                if any(item["place"] == place for item in rows):
+                    continue
                 world = build_world(scenario, scenario.build_policy())
                 on_step = partial(_shown, show, place, world.horizon)
-                rows.append(
-                    {
-                        "place": place,
-                        **row(world, measure_reach(world, on_step=on_step)),
-                    }
-                )
+                figures = row(world, measure_reach(world, on_step=on_step))
+                rows.append({"place": place, **figures})
+                if self.output is not None:
+                    text = pd.DataFrame(rows).to_csv(index=False, float_format="%.6g")
+                    files.write_text(self.output, text)
                 del world
                 gc.collect()
-        document = publish("reach", self, {"places": rows})
-        return Result(document, lambda: print(table(rows)))
+        return Result({"places": rows}, lambda: print(table(rows)))
 
     def _scenarios(self) -> Iterator[tuple[str, Scenario]]:
         if "scenario" not in files.read_toml(self.file):

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from support.worlds import loops as toy
@@ -165,6 +166,21 @@ def test_the_command_prints_a_row(path, capsys):
     assert row["up_m"] != row["original_m"]
     assert main(words) == 0
     assert f"{HORIZON} of {HORIZON}" in capsys.readouterr().out
+
+
+def test_a_table_of_places_goes_on(path, tmp_path, capsys):
+    output = tmp_path / "reach.csv"
+    words = ["reach", str(path), "--set", f"drive.horizon={HORIZON}", "-o", str(output)]
+    assert main([*words, "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["places"]
+    (line,) = pd.read_csv(output).to_dict("records")
+    assert line["place"] == row["place"]
+    assert line["up_m"] == pytest.approx(row["up_m"], rel=1e-5)
+    output.write_text(output.read_text().replace(path.stem, "another"))
+    assert main([*words, "--json"]) == 0  # the place has no row again
+    assert len(json.loads(capsys.readouterr().out)["places"]) == 2
+    begun = output.stat().st_mtime_ns
+    assert main(words) == 0 and output.stat().st_mtime_ns == begun
 
 
 def test_what_belongs_to_the_other_kind_of_file_is_refused(path, tmp_path, capsys):
