@@ -53,12 +53,14 @@ def draw_ratios(figure: Figure, ratios: Mapping[str, tuple[float, Interval]]) ->
     _name_rows(figure, list(ratios))
 
 
-def draw_shares(figure: Figure, shares: Mapping[str, float]) -> None:
-    """Draw one bar per case: the share of drives that leave the lane."""
+def draw_shares(figure: Figure, shares: Mapping[str, float], label: str) -> None:
+    """Draw one bar per name: a share of what the label says."""
     axis = figure.subplots()
     axis.barh(range(len(shares)), list(shares.values()), color=BLUE)
-    axis.set_xlim(0, 1)
-    axis.set_xlabel("share of drives that leave the lane")
+    for row, share in enumerate(shares.values()):
+        axis.text(share + 0.01, row, f"{100 * share:.0f} %", va="center")
+    axis.set_xlim(0, 1.1)
+    axis.set_xlabel(label)
     _name_rows(figure, list(shares))
 
 

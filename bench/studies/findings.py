@@ -8,12 +8,12 @@ of their share lies above one half. A study with missing attacks claims nothing.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from bench.studies.charts import (
     draw_heat,
@@ -22,20 +22,18 @@ from bench.studies.charts import (
     draw_searches,
     draw_shares,
 )
+from bench.studies.content import Finding, ends_cell, interval_words, metres
+from bench.studies.limits import limits
 from bench.studies.plan import Study, state
 from mi_nerfattack.drives.table import records, with_starts
 from mi_nerfattack.evaluation.pairs import compare
-from mi_nerfattack.evaluation.summary import (
-    Interval,
-    interval,
-    share_interval,
-    summary,
-)
+from mi_nerfattack.evaluation.summary import interval, share_interval, summary
 from mi_nerfattack.experiment.sweep.summary import GRADIENT
 from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, NO_OBJECT, RANDOM
 from mi_nerfattack.scenario.deployment import SURROGATE
 
 HALF = 0.5  # of the error in the surrogate, and of the places
+_BY_GRADIENT = ("attached", "open_loop", "single_frame")
 EQUAL = 0.8  # of the gradient's frames, from which on a search has an equal budget
 _ERROR = "cross_track_mean_m"
 _CASES = {
@@ -48,29 +46,6 @@ _OF_SEARCHES = (
     "attacks = drives.query(\"case == 'attack' and environment == 'surrogate'\")\n"
     'print(attacks.groupby(["method", "route"]).cross_track_mean_m.mean().unstack())'
 )
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What a page shows.
-
-    Attributes:
-        title: the finding, a sentence without its full stop.
-        sentences: three.
-        head: of the table.
-        rows: of the table.
-        draw: draws the chart in an empty figure.
-        pandas: the second and the third line that read the data.
-        threats: to validity, which depend on the rows.
-    """
-
-    title: str
-    sentences: tuple[str, str, str]
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    draw: Callable[[Figure], None]
-    pandas: str
-    threats: tuple[str, ...] = ()
 
 
 def is_farther(one: pd.DataFrame, other: pd.DataFrame) -> tuple[int, bool]:
@@ -107,7 +82,7 @@ def finding(study: Study) -> Finding | None:
     made, one = make(table), state(study, compare=False)
     if one.done == one.wanted:
         return made
-    exist = f"{one.done} of {one.wanted} attacks exist"
+    exist = f"{one.done} of {one.wanted} {study.units} exist"
     return replace(made, title=f"Not yet known {question}: {exist}")
 
 
@@ -128,7 +103,7 @@ def attack(drives: pd.DataFrame) -> Finding:
     rows = [
         [
             *(_CASES[row["case"]], row["environment"], f"{row[_ERROR]:.3f}"),
-            _ends(row["cross_track_mean_ci95_m"]),
+            ends_cell(row["cross_track_mean_ci95_m"]),
             f"{row['attacks_out']}/{row['attacks']}",
         ]
         for row in records(groups)
@@ -141,22 +116,40 @@ def attack(drives: pd.DataFrame) -> Finding:
             "The interval of the ratio of the means contains 1, because few attacks "
             "are much stronger than the others. So the title counts places."
         )
+    cost = by_case[ATTACK]["frames"].max(), by_case[BEST_RANDOM]["frames"].max()
+    threats.append(
+        "The worst random texture is the one with the largest error in the surrogate. "
+        f"The random textures cost {cost[1]:,} frames, and the attack up to "
+        f"{cost[0]:,}. [The page about the gradient](gradient.md) compares at equal "
+        "cost."
+    )
+    routes = by_case[ATTACK].groupby("route", sort=False)["departed"].sum()
+    threats.append(
+        "Drives that leave the lane, by route: "
+        f"{', '.join(f'{route} {count}' for route, count in routes.items())}."
+    )
+    means = _by_place(by_case[ATTACK])
+    threats.append(
+        f"One place, {_name(means.idxmax())}, has a mean error of "
+        f"{means.max():.2f} m. The mean over the other places is "
+        f"{means.drop(means.idxmax()).mean():.2f} m."
+    )
     errors = pd.DataFrame({n: _by_place(by_case[case]) for case, n in _CASES.items()})
-    errors.index = [f"{name.split(',')[0]} {seed}" for name, seed in errors.index]
+    errors.index = [_name(place) for place in errors.index]
     return Finding(
         title,
         (
             f"In the environment `{where}`, the attack moves the car {found.one:.2f} m "
             f"from the lane centre on average, and the worst random texture "
             f"{found.other:.2f} m (ratio {found.ratio:.1f}, "
-            f"{_interval(found.ratio_ci95, 1)}).",
-            f"The attack is farther at {places}, and a wheel leaves the lane for a "
-            f"second at {out} of them (share: "
-            f"{_interval(share_interval(out, found.attacks), 2)}).",
+            f"{interval_words(found.ratio_ci95, 1)}).",
+            f"The attack is farther at {places}, and at {out} places a wheel is out of "
+            "the lane for a second on average over the drives (share: "
+            f"{interval_words(share_interval(out, found.attacks), 2)}).",
             f"The mean difference is {found.difference:.2f} m, and its standard "
-            f"deviation from seed to seed is {_metres(found.spread)}.",
+            f"deviation between the places of a route is {metres(found.spread)}.",
         ),
-        ["texture", "environment", "mean error (m)", "95 % interval", "attacks out"],
+        ["texture", "environment", "mean error (m)", "95 % interval", "a wheel out"],
         rows,
         lambda figure: draw_places(figure, errors),
         f'deployed = drives[drives.environment == "{where}"]\n'
@@ -174,24 +167,34 @@ def gradient(drives: pd.DataFrame) -> Finding:
     farther = {name: is_farther(base, side) for name, side in sides.items()}
     frames = own.groupby("method", sort=False)["frames"].mean()
     fair = {name: found[name] for name in found if _is_equal(frames, name)}
-    better = [name for name in fair if farther[name][1]]
-    title = (
-        f"The gradient beats {len(better)} of {len(fair)} other searches at equal cost"
+    without = [name for name in fair if name not in _BY_GRADIENT]
+    others = [name for name in fair if name in _BY_GRADIENT]
+    better, also = (
+        sum(farther[name][1] for name in names) for names in (without, others)
     )
-    means = own.groupby(["route", "method"], sort=False)[_ERROR].mean().unstack()
-    above = means[list(fair)].lt(means[GRADIENT], axis=0).to_numpy()
+    title = (
+        f"The gradient beats {better} of {len(without)} searches without a gradient at "
+        "equal cost"
+    )
     close, nearest = min(fair.items(), key=lambda item: item[1].ratio or 0.0)
+    wins = [farther[name][0] for name in fair]
     threats = [
-        f"`{name}` rendered {frames[name]:.0f} frames and the gradient "
-        f"{frames[GRADIENT]:.0f}, so the title leaves this search out."
+        f"`{name}` cost {frames[name]:.0f} frames and the gradient "
+        f"{frames[GRADIENT]:.0f}, so the comparison leaves this search out."
         for name in found
         if name not in fair
+    ]
+    places = own.groupby(["scenario", "seed", "method"])[_ERROR].mean().unstack()
+    behind = places[places[GRADIENT] < places[list(fair)].max(axis=1)]
+    threats += [
+        f"At {_name(place)}, another search is better: the gradient has {error:.2f} m."
+        for place, error in behind[GRADIENT].items()
     ]
     rows = [
         [
             *(name, f"{frames[name]:.0f}", f"{effect.other:.3f}"),
-            *(f"{effect.ratio:.2f}", _ends(effect.ratio_ci95, 2)),
-            *(f"{farther[name][0]}/{effect.attacks}", _metres(effect.spread)),
+            *(f"{effect.ratio:.2f}", ends_cell(effect.ratio_ci95, 2)),
+            *(f"{farther[name][0]}/{effect.attacks}", metres(effect.spread)),
         ]
         for name, effect in found.items()
     ]
@@ -199,11 +202,14 @@ def gradient(drives: pd.DataFrame) -> Finding:
         title,
         (
             f"Over {nearest.attacks} places, the gradient moves the car "
-            f"{nearest.one:.2f} m from the lane centre on average in the surrogate.",
+            f"{nearest.one:.2f} m from the lane centre on average in the surrogate, "
+            f"and beats {also} of {len(others)} other searches that use a gradient "
+            f"({', '.join(f'`{name}`' for name in others)}).",
             f"The closest other search is `{close}`: the gradient moves the car "
-            f"{nearest.ratio:.2f} times as far ({_interval(nearest.ratio_ci95, 2)}).",
-            f"The gradient has the larger mean in {above.sum()} of {above.size} pairs "
-            "of a search and a route.",
+            f"{nearest.ratio:.2f} times as far "
+            f"({interval_words(nearest.ratio_ci95, 2)}).",
+            f"Compared with each of these searches, the gradient is farther at "
+            f"{min(wins)} to {max(wins)} of {nearest.attacks} places.",
         ),
         [
             *("search", "frames", "mean error (m)", "gradient to search"),
@@ -224,15 +230,15 @@ def searches(drives: pd.DataFrame) -> Finding:
     errors = own.groupby(["method", "route"], sort=False)[_ERROR].mean().unstack()
     rank = errors.dropna().map(math.log).mean(axis=1).map(math.exp)
     best = str(rank.idxmax())
-    title = f"Of {len(errors)} searches, `{best}` moves the car farthest"
+    title = f"Of {len(rank)} searches, `{best}` moves the car farthest"
     spread = own.groupby("cell")[_ERROR].std().mean()
     return Finding(
         title,
         (
             f"Of the {len(rank)} searches with an attack on each of these routes, "
             f"`{best}` has the largest geometric mean, {rank.max():.2f} m.",
-            "There is one place per route, which is too few for an interval, so this "
-            "table chooses a search and proves nothing.",
+            "There is one place per route, so the table has no intervals and the order "
+            "is uncertain.",
             "Between the starts of one attack, the error has a standard deviation of "
             f"{spread:.3f} m on average.",
         ),
@@ -260,7 +266,8 @@ def flat(drives: pd.DataFrame) -> Finding:
         (
             f"With the attacked picture, {left[ATTACK]} of {count[ATTACK]} drives "
             "leave the lane in the path-traced scene that lights the picture.",
-            f"With random pictures, {left[RANDOM]} of {count[RANDOM]} drives leave it.",
+            f"With random pictures, {left[RANDOM]} of {count[RANDOM]} drives leave the "
+            "lane.",
             "The aim that we set before the first result is 60 % of the drives with "
             "the attack, and none with random pictures.",
         ),
@@ -269,7 +276,9 @@ def flat(drives: pd.DataFrame) -> Finding:
             [_CASES[case], f"{groups[_ERROR][case]:.3f}", f"{left[case]}/{count[case]}"]
             for case in groups.index
         ],
-        lambda figure: draw_shares(figure, shares),
+        lambda figure: draw_shares(
+            figure, shares, "share of drives that leave the lane"
+        ),
         'lit = drives[drives.environment == "built_in"]\n'
         'print(lit.groupby(["objects", "case"]).departed.mean())',
     )
@@ -277,10 +286,10 @@ def flat(drives: pd.DataFrame) -> Finding:
 
 def transfer(drives: pd.DataFrame) -> Finding:
     """Compare each environment and condition with the surrogate by day."""
-    own, columns = drives[drives["case"] == ATTACK], ["environment", "condition"]
-    table = own.pivot_table(_ERROR, "attack", columns, sort=False)
-    logs = table.div(table[SURROGATE]["day"], axis=0).map(math.log)
-    heat = logs.mean().map(math.exp).unstack(sort=False)
+    logs, without = (_to_surrogate(drives, case) for case in (ATTACK, NO_OBJECT))
+    heat, empty = (
+        one.mean().map(math.exp).unstack(sort=False) for one in (logs, without)
+    )
     by_day = heat["day"].drop(SURROGATE)
     ends = {
         name: np.exp(found).tolist()
@@ -289,9 +298,10 @@ def transfer(drives: pd.DataFrame) -> Finding:
     }
     kept = sum(low > HALF for low, _ in ends.values())
     lost = sum(high < HALF for _, high in ends.values())
+    count = len(by_day)
     title = (
-        f"Attacks keep half of their error in {kept} of {len(by_day)} environments, "
-        f"and lose it in {lost}"
+        f"Attacks keep more than half of their error in {kept} of {count} "
+        f"environments, and less than half in {lost}"
     )
     return Finding(
         title,
@@ -299,16 +309,45 @@ def transfer(drives: pd.DataFrame) -> Finding:
             f"By day, the error with the attack is {by_day.max():.2f} times the error "
             f"in the surrogate in `{by_day.idxmax()}`, and {by_day.min():.2f} times in "
             f"`{by_day.idxmin()}`.",
-            f"The 95 % interval of this ratio lies above one half in {kept} of "
-            f"{len(by_day)} environments, and below one half in {lost}.",
-            f"These are geometric means over {len(table)} attacks, paired by attack.",
+            f"In {count - kept - lost} environments, the 95 % interval of this ratio "
+            "contains one half.",
+            f"These are geometric means over {len(logs)} places with "
+            f"{drives['attack'].nunique()} attacks, and attacks at one place count as "
+            "one value.",
         ),
-        ["environment, by day", "error to the surrogate's", "95 % interval"],
-        [[str(n), f"{x:.2f}", _ends(ends.get(n), 2)] for n, x in by_day.items()],
+        [
+            *("environment, by day", "error to the surrogate's", "95 % interval"),
+            "without objects",
+        ],
+        [
+            [str(n), f"{x:.2f}", ends_cell(ends.get(n), 2), f"{empty['day'][n]:.2f}"]
+            for n, x in by_day.items()
+        ],
         lambda figure: draw_heat(figure, heat),
-        'attacks = drives[drives.case == "attack"]\n'
-        'print(attacks.pivot_table("cross_track_mean_m", "environment", "condition"))',
+        "own = drives.query(\"case == 'attack' and condition == 'day'\")\n"
+        'print(own.pivot_table("cross_track_mean_m", "environment", "route"))',
+        (
+            "Grey cells of the chart are not driven. The labels are those of "
+            "[transfer](../transfer.md).",
+        ),
     )
+
+
+def _to_surrogate(drives: pd.DataFrame, case: str) -> pd.DataFrame:
+    """Divide errors by the error with the attack in the surrogate by day.
+
+    Returns:
+        Mean logarithms of a place (row), by environment and condition.
+    """
+    rows, columns = ["route", "attack"], ["environment", "condition"]
+    table, attacks = (
+        drives[drives["case"] == name].pivot_table(_ERROR, rows, columns, sort=False)
+        for name in (case, ATTACK)
+    )
+    logs = table.div(attacks[SURROGATE]["day"], axis=0).map(math.log)
+    # The name of an attack ends with the seed of its place and a digest
+    seeds = logs.index.get_level_values("attack").str.split("-").str[-2]
+    return logs.groupby([logs.index.get_level_values("route"), seeds]).mean()
 
 
 #: By the name of the page: what is not known while attacks are missing, and the rest.
@@ -318,12 +357,19 @@ FINDINGS: dict[str, tuple[str, Callable[[pd.DataFrame], Finding]]] = {
     "searches": ("which search by gradient is best", searches),
     "flat": ("whether flat objects mislead the policy", flat),
     "transfer": ("whether attacks transfer", transfer),
+    "limits": ("what limits attacks", limits),
 }
 
 
 def _attacks(drives: pd.DataFrame) -> pd.DataFrame:
     """Return the drives with the attack in the surrogate."""
     return drives[(drives["environment"] == SURROGATE) & (drives["case"] == ATTACK)]
+
+
+def _name(place: Any) -> str:
+    """Return a short name of a scenario and its seed: the route and the seed."""
+    scenario, seed = place
+    return f"{str(scenario).split(',')[0]} {seed}"
 
 
 def _is_equal(frames: pd.Series, name: str) -> bool:
@@ -334,18 +380,3 @@ def _is_equal(frames: pd.Series, name: str) -> bool:
 def _by_place(drives: pd.DataFrame) -> pd.Series:
     """Return the mean error by scenario and seed, metres."""
     return drives.groupby(["scenario", "seed"], sort=False)[_ERROR].mean()
-
-
-def _ends(ends: Interval, digits: int = 3) -> str:
-    """Return an interval as a cell of a table."""
-    return "–" if ends is None else f"{ends[0]:.{digits}f} to {ends[1]:.{digits}f}"
-
-
-def _interval(ends: Interval, digits: int) -> str:
-    """Return an interval as words."""
-    few = "too few places for an interval"
-    return few if ends is None else f"95 % interval {_ends(ends, digits)}"
-
-
-def _metres(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.2f} m"

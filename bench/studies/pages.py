@@ -57,7 +57,7 @@ def page_text(study: Study, made: Finding, one: State, picture: str) -> str:
         picture: address of the chart.
     """
     data, rule = f"{study.table}/{study.rows}", study.grid or "bench/results.toml"
-    threats = [f"The table has {one.done} of {one.wanted} attacks."]
+    threats = [f"The table has {one.done} of {one.wanted} {study.units}."]
     if UNKNOWN in one.sources:
         threats.append(
             "Nobody recorded which version of the source made these rows, so today's "

@@ -77,6 +77,11 @@ class Study(Section):
         return self
 
     @property
+    def units(self) -> str:
+        """What a unit is, in the plural."""
+        return "attacks" if self.unit == "cell" else f"{self.unit}s"
+
+    @property
     def folder(self) -> Path:
         """The folder of the committed table."""
         return ROOT / self.table

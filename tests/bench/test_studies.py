@@ -23,7 +23,7 @@ from mi_nerfattack.experiment.sweep.table import COLUMNS, make_table, write_tabl
 from mi_nerfattack.io import files
 
 STUDIES = {study.name: study for study in read_plan().studies}
-PAGES = {study.finding: study for study in STUDIES.values() if study.finding}
+PAGES = {s.finding: s for s in STUDIES.values() if s.finding and s.read() is not None}
 GRID = """
 scenario = "bundled:base.toml"
 seeds = [1, 2]
@@ -81,6 +81,10 @@ def test_a_page_is_what_its_table_gives(name):
     assert page == text, "run python -m bench results --pages"
     assert 0 < (ROOT / f"docs/pictures/finding_{name}.png").stat().st_size < 100_000
     assert len(made.sentences) == 3 and len(made.pandas.splitlines()) == 2
+
+
+def test_only_findings_with_rows_have_a_page():
+    assert {path.stem for path in FOLDER.glob("*.md")} == {*PAGES, "index"}
 
 
 @pytest.mark.parametrize("name", PAGES)
@@ -142,26 +146,50 @@ def test_the_gradient_is_compared_with_each_search():
     cheap = rows["method"] == "single_frame"
     rows.loc[cheap, "frames"] = 7  # of 9
     found = made("gradient", rows)
-    assert found.title == "The gradient beats 1 of 2 other searches at equal cost"
-    assert "`single_frame`" in found.threats[0] and len(found.threats) == 1
+    assert "beats 1 of 2 searches without a gradient" in found.title
+    assert "0 of 0 other searches" in found.sentences[0]
+    assert "`single_frame`" in found.threats[0]
+    assert len(found.threats) == 1 + 6  # places where `blocks` is better
     assert [row[3] for row in found.rows] == ["2.00", "0.80", "4.00"]
-    assert "`blocks`" in found.sentences[1] and "1 of 2 pairs" in found.sentences[2]
+    assert "`blocks`" in found.sentences[1] and "0 to 6 of 6" in found.sentences[2]
 
 
-def test_transfer_counts_environments_that_keep_half():
-    """The ratios of all attacks are equal, so their intervals are points."""
+def test_transfer_counts_places_not_attacks():
+    """The ratios of all places are almost equal, so their intervals are points."""
     rows = [
-        {"attack": f"a{k}", "environment": where, "condition": "day", "case": "attack"}
-        | {"cross_track_mean_m": factor * (1 + k)}
+        {"attack": f"left-{name}-{seed}-0", "environment": where, "condition": "day"}
+        | {"route": "left", "case": case, "cross_track_mean_m": error * (1 + seed)}
         for where, factor in (("surrogate", 1.0), ("kept", 0.8), ("lost", 0.2))
-        for k in range(5)
+        for seed in range(5)
+        for name, change in (("one", 2), ("two", 0.5))
+        for case, error in (
+            ("attack", factor * (change + seed / 1e4 if factor < 1 else 1)),
+            ("no_object", 0.1),
+        )
     ]
     found = made("transfer", pd.DataFrame(rows))
-    assert "in 1 of 2 environments, and lose it in 1" in found.title
+    assert "in 1 of 2 environments, and less than half in 1" in found.title
+    assert "5 places with 10 attacks" in found.sentences[2]
     assert found.rows == [
-        ["kept", "0.80", "0.80 to 0.80"],
-        ["lost", "0.20", "0.20 to 0.20"],
+        ["kept", "0.80", "0.80 to 0.80", "0.10"],
+        ["lost", "0.20", "0.20 to 0.20", "0.10"],
     ]
+
+
+def test_limits_counts_places_beyond_the_lane():
+    rows = [
+        {"place": f"{route}-{kind}-{seed}", "pixels": 10, "moved": 0.1 * number}
+        | {"original_m": 0.1, "up_m": up, "down_m": 0.2, "limit_m": 0.85}
+        for number, (route, kind, up) in enumerate(
+            [("left", "patch", 0.9), ("left", "billboard", 0.8)], 1
+        )
+        for seed in (1, 2)
+    ]
+    found = made("limits", pd.DataFrame(rows))
+    assert found.title.endswith("at 2 of 4 places")
+    assert [row[2] for row in found.rows] == ["2/2", "0/2"]
+    assert "a patch on the route `left`" in found.sentences[1]
+    assert "0.10 rad/s" in found.sentences[1]
 
 
 def test_charts_draw_ratios_intervals_and_heat():

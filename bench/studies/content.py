@@ -1,0 +1,49 @@
+"""What a page of docs/findings shows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from matplotlib.figure import Figure
+
+from mi_nerfattack.evaluation.summary import Interval
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a page shows.
+
+    Attributes:
+        title: the finding, a sentence without its full stop.
+        sentences: three.
+        head: of the table.
+        rows: of the table.
+        draw: draws the chart in an empty figure.
+        pandas: the second and the third line that read the data.
+        threats: to validity, which depend on the rows.
+    """
+
+    title: str
+    sentences: tuple[str, str, str]
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    draw: Callable[[Figure], None]
+    pandas: str
+    threats: tuple[str, ...] = ()
+
+
+def ends_cell(ends: Interval, digits: int = 3) -> str:
+    """Return an interval as a cell of a table."""
+    return "–" if ends is None else f"{ends[0]:.{digits}f} to {ends[1]:.{digits}f}"
+
+
+def interval_words(ends: Interval, digits: int) -> str:
+    """Return an interval as words."""
+    few = "too few places for an interval"
+    return few if ends is None else f"95 % interval {ends_cell(ends, digits)}"
+
+
+def metres(value: float | None) -> str:
+    """Return a length as words."""
+    return "unknown" if value is None else f"{value:.2f} m"
