@@ -19,8 +19,9 @@ class CertifyRobustness:
     Drives past random changes of the textures' low frequencies. From the share of
     departures follows a bound for every change within a radius, of the drive under
     this noise. Beside it stands the best attack that a search finds within the radius.
-    Finished drives are kept: the same command continues after Ctrl-C, and more drives
-    or radii add to them.
+    Choose --runs before the first result: the confidence holds for one number of runs.
+    Finished drives are kept: the same command continues after Ctrl-C. More radii add
+    to the drives, and all their bounds hold together.
     """
 
     continues: ClassVar[bool] = True
@@ -97,6 +98,8 @@ class CertifyRobustness:
         def tell() -> None:
             out = console()
             out.print(robustness_table(document))
+            for line in document["flags"]:
+                out.print(f"flag: {line}", highlight=False)
             out.print(f"Written: {self.output.resolve()}", soft_wrap=True)
 
         return Result(document, tell)

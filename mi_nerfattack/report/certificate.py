@@ -47,11 +47,15 @@ def gradient_table(document: Mapping[str, Any]) -> Table:
         Column("cosine", "cosine"),
         Column("95 % of the cosine", "cosine_ci95", short="95 %"),
         Column("along the gradient", _along, short="along"),
-        Column("true", lambda row: "yes" if row["is_true"] else "no"),
+        Column("true", lambda row: _TRUE[row["is_true"]]),
     ]
     title = f"Real by predicted changes along {document['directions']} directions"
     label = Column("horizon (s)", lambda row: f"{row['time_s']:g}")
     return Table(title, [label], figures, document["rows"])
+
+
+#: A dash where neither the gradient nor the drives change the objective.
+_TRUE = {True: "yes", False: "no", None: "–"}
 
 
 def _along(row: Mapping[str, Any]) -> float | None:

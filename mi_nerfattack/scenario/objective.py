@@ -297,7 +297,7 @@ class VarySection(Section):
     #: Of the number whose size is the time constant of the steering.
     steering_lag_s_sd: NonNegative = 0.0
     #: Of the number whose size adds to the delay of the controls.
-    delay_s_sd: NonNegative = 0.0
+    delay_s_sd: Annotated[float, Field(ge=0, le=5)] = 0.0
     later: ClassVar[tuple[str, ...]] = ("sun", "steering_lag_s_sd", "delay_s_sd")
 
     def applied(self, loop: ClosedLoop, seed: int) -> ClosedLoop:

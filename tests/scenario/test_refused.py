@@ -151,6 +151,7 @@ field = "scene.safetensors" -> field = "a"; surrogate = "a.xml" => :3: scene.fie
 field = "object.safetensors" -> => objects.0.field: is missing
 field = "scene.safetensors" -> field = "a"; spp = 2 => :4: scene.spp: .* 1, 4, 9 or 16
 [attack.vary]; speed_sd = 1.5 => attack.vary.speed_sd: .* 1
+[attack.vary]; delay_s_sd = 100.0 => attack.vary.delay_s_sd: .* 5
 [attack.vary]; light_ev_sd = 9 => attack.vary.light_ev_sd: .* 8
 [attack.vary]; sun.share = [0.5, 0.96] => attack.vary.sun.share: .* from 0 to 0.95
 [attack.vary]; sun.elevation_deg = [40, 20] => elevation_deg: .* from 0 to 90

@@ -209,20 +209,20 @@ def _document(work: Differences, ended: Ended) -> dict[str, Any]:
     for number, horizon in enumerate(ended.horizons):
         p, r = predicted[number], real[number]
         both = agreement(p[:-1], r[:-1])
+        # There is nothing to judge, for example before an object comes into view.
+        unchanged = not p.any() and not r.any()
         rows.append(
             {
                 "periods": horizon,
                 "time_s": horizon * dt,
                 **({} if both is None else _figures(both)),
-                "is_true": both is not None and both.is_true,
+                "is_true": None if unchanged else both is not None and both.is_true,
                 "along_predicted": float(p[-1]),
                 "along_real": float(r[-1]),
                 "predicted": p[:-1].tolist(),
                 "real": r[:-1].tolist(),
             }
         )
-    true = [row["is_true"] for row in rows]
-    last = true.index(False) if False in true else len(rows)
     scenario = ended.world.scenario
     document = {
         "schema": SCHEMA,
@@ -230,12 +230,26 @@ def _document(work: Differences, ended: Ended) -> dict[str, Any]:
         "seed": scenario.seed,
         "method": scenario.attack.method.kind,
         "attached": scenario.attack.attached,
+        "levels": "all",
+        "attack_one_level": ended.attack.one_level,
+        "attack_follow": ended.attack.plan.follow,
         "directions": work.directions,
         "step": work.step,
-        "true_until_s": rows[last - 1]["time_s"] if last else 0.0,
+        "true_until_s": _true_until_s(rows),
         "rows": rows,
     }
     return document | {"flags": _flags(document)}
+
+
+def _true_until_s(rows: Sequence[Mapping[str, Any]]) -> float:
+    """Return the last true horizon before an untrue one; skip those without changes."""
+    until = 0.0
+    for row in rows:
+        if row["is_true"] is False:
+            break
+        if row["is_true"]:
+            until = row["time_s"]
+    return until
 
 
 def _figures(both: Agreement) -> dict[str, Any]:
@@ -245,8 +259,14 @@ def _figures(both: Agreement) -> dict[str, Any]:
 
 def _flags(document: Mapping[str, Any]) -> list[str]:
     """Say where the gradient is untrue."""
-    end = document["rows"][-1]["time_s"]
-    if (until := document["true_until_s"]) == end:
+    rows, until = document["rows"], document["true_until_s"]
+    end = rows[-1]["time_s"]
+    if all(row["is_true"] is None for row in rows):
+        return [
+            f"in {end:g} s, neither the gradient nor the drives change the objective, "
+            "so there is nothing to judge; take a longer horizon"
+        ]
+    if all(row["is_true"] is not False for row in rows):
         return []
     low, high = SLOPES
     where = f"up to {until:g} s of {end:g} s" if until else "over no part of the drive"
@@ -286,7 +306,18 @@ def _write(output: Path, document: Mapping[str, Any]) -> None:
 
 def sentences(document: Mapping[str, Any]) -> Sequence[str]:
     """Say in words what a certificate found."""
-    end = document["rows"][-1]["time_s"]
-    if document["flags"]:
-        return [f"flag: {line}" for line in document["flags"]]
-    return [f"The gradient predicts the objective of the whole drive of {end:g} s."]
+    said = [f"flag: {line}" for line in document["flags"]] or [
+        "The gradient predicts the objective at all horizons with changes, up to "
+        f"{document['true_until_s']:g} s."
+    ]
+    if document["attack_one_level"]:
+        said.append(
+            "The attack stepped along the gradient of one level; this one is of all "
+            "levels."
+        )
+    if document["attached"] and document["attack_follow"] != "always":
+        said.append(
+            "Not all gradients of the attack were attached, see method.follow; this "
+            "one is."
+        )
+    return said

@@ -129,8 +129,9 @@ class Smoothing:
         stream = _STREAMS[purpose]
         rng = np.random.default_rng([self.scenario.seed, stream, number])
         noise = self.sd * rng.standard_normal(self.count)
-        # 2^40: a stream of words that neither attacks nor the noise begin with
-        own = (1 << 40) + (stream << 32) + number
+        # The words [stream, number, 1], of 32 bits each, are one more than the noise
+        # has. So no start shares its random numbers with the noise of any drive.
+        own = (1 << 64) + (number << 32) + stream
         [start] = initial_states(self.scenario, world.route, 1, own)
         return Draw(noise, start, int(rng.integers(2**31)))
 

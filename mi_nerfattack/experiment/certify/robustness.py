@@ -217,6 +217,9 @@ def certify_robustness(
     with locks.claimed(output):
         check_folder(output, DRIVES, DRIVES_TABLE)
         locks.remove_partial(output)
+        evaluated = _evaluated(output)
+        if settings.runs not in evaluated:
+            evaluated.append(settings.runs)
         world = build_world(scenario, scenario.build_policy())
         looks = Looks(world, settings.coefficients)
         label = settings.environment
@@ -236,6 +239,8 @@ def certify_robustness(
             "scenario": scenario.name,
             "seed": scenario.seed,
             "settings": asdict(settings) | {"radii": list(settings.radii)},
+            "looks": evaluated,
+            "flags": _flags(evaluated, confidence),
             "coefficients": looks.count,
             "departure_limit_m": job.lane.wheel_m,
             "departed": departed,
@@ -249,6 +254,36 @@ def certify_robustness(
         }
         _write(output, document, job, centre, attacked)
     return document
+
+
+def _evaluated(output: Path) -> list[int]:
+    """Return the numbers of runs that certificates in the folder are of, in order.
+
+    Raises:
+        InputError: ``certificate.json`` is damaged, or of another kind or version.
+    """
+    path = output / DOCUMENT
+    if not path.exists():
+        return []
+    document = files.read_json(path)
+    looks = document.get("looks") if isinstance(document, dict) else None
+    if not isinstance(looks, list):
+        raise InputError(
+            f"{path}: does not list the numbers of runs of earlier results ('looks'); "
+            "choose another folder"
+        )
+    return looks
+
+
+def _flags(evaluated: Sequence[int], confidence: float) -> list[str]:
+    """Say that the number of runs followed from results."""
+    if len(evaluated) < 2:
+        return []
+    numbers = ", ".join(f"{runs}" for runs in evaluated)
+    return [
+        f"this folder was evaluated with {numbers} runs; if an earlier result decided "
+        f"about the last number, the confidence is less than {100 * confidence:g} %"
+    ]
 
 
 def check_folder(output: Path, *names: str) -> None:

@@ -14,9 +14,10 @@ from support.pages.read import drawn
 
 from mi_nerfattack import cli
 from mi_nerfattack.experiment.certify.directions import Ended, truncated
-from mi_nerfattack.experiment.certify.gradient import certify_gradient
+from mi_nerfattack.experiment.certify.gradient import certify_gradient, sentences
 from mi_nerfattack.experiment.job import Job
 from mi_nerfattack.io import files
+from mi_nerfattack.report.certificate import gradient_table
 from mi_nerfattack.report.plots.certificate import plot_gradient
 from mi_nerfattack.rollout.objective import StageSum, Terminal, WeightedSum
 from mi_nerfattack.scenario.scenario import load_scenario
@@ -99,6 +100,68 @@ def test_a_gradient_of_another_drive_is_flagged(attached_run, tmp_path, monkeypa
     document = certify_gradient(attached_run, tmp_path, 5, 0.05, InThisProcess())
     assert document["true_until_s"] == 0.0 and len(document["flags"]) == 1
     assert document["rows"][-1]["slope"] == pytest.approx(-1, abs=0.1)
+
+
+def blind(monkeypatch, horizons, real=True, predicted=True):
+    """Let objectives at some horizons (numbers) depend on nothing."""
+    costs, gradient = Ended.costs, Ended.gradient
+
+    def flat_costs(self, change, on_step=None):
+        values = costs(self, change, on_step)
+        values[horizons if real else []] = 0.0
+        return values
+
+    def flat_gradient(self, horizon, on_step=None):
+        values = gradient(self, horizon, on_step)
+        flat = predicted and self.horizons.index(horizon) in horizons
+        return {key: 0 * value if flat else value for key, value in values.items()}
+
+    monkeypatch.setattr(Ended, "costs", flat_costs)
+    monkeypatch.setattr(Ended, "gradient", flat_gradient)
+
+
+@pytest.mark.parametrize("horizons", [[0, 1], [2]])
+def test_horizons_without_changes_are_not_judged(
+    horizons, attached_run, tmp_path, monkeypatch
+):
+    blind(monkeypatch, horizons)
+    document = certify_gradient(attached_run, tmp_path, 5, 0.05, InThisProcess())
+    judged = [row["is_true"] for row in document["rows"]]
+    assert judged == [None if k in horizons else True for k in range(5)]
+    assert document["flags"] == [] and document["true_until_s"] == pytest.approx(0.6)
+    cells = [cells[-1] for _, _, cells in gradient_table(document).body]
+    assert [cell.text for cell in cells].count("–") == len(horizons)
+    assert pd.read_csv(tmp_path / "certificate.csv")["is_true"].isna().sum() == len(
+        horizons
+    )
+
+
+@pytest.mark.parametrize("real", [True, False])
+def test_a_change_on_one_side_alone_is_untrue(
+    real, attached_run, tmp_path, monkeypatch
+):
+    blind(monkeypatch, [1, 2], real=real, predicted=not real)
+    document = certify_gradient(attached_run, tmp_path, 5, 0.05, InThisProcess())
+    judged = [row["is_true"] for row in document["rows"]]
+    assert judged == [True, False, False, True, True]
+    assert document["true_until_s"] == pytest.approx(0.1) and document["flags"]
+
+
+def test_without_any_change_nothing_is_said_to_be_true(
+    attached_run, tmp_path, monkeypatch
+):
+    blind(monkeypatch, [0, 1, 2, 3, 4])
+    document = certify_gradient(attached_run, tmp_path, 3, 0.05, InThisProcess())
+    assert document["true_until_s"] == 0.0 and len(document["flags"]) == 1
+    assert {row["is_true"] for row in document["rows"]} == {None}
+
+
+def test_a_gradient_that_the_attack_did_not_follow_is_named(certified):
+    _, document = certified
+    assert document["levels"] == "all" and document["attack_follow"] == "always"
+    assert document["attack_one_level"] is False and len(sentences(document)) == 1
+    others = {"attack_one_level": True, "attack_follow": "in_turns"}
+    assert len(sentences({**document, **others})) == 3
 
 
 def test_objectives_end_with_the_horizon():

@@ -13,7 +13,14 @@ from support.pages.read import drawn
 from mi_nerfattack.backend.determinism import one_thread
 from mi_nerfattack.deploy.environment import drive
 from mi_nerfattack.drives.store import Store
-from mi_nerfattack.experiment.certify.noise import CENTRE, Looks, NoisyDrives, Smoothing
+from mi_nerfattack.experiment.certify.noise import (
+    ATTACKED,
+    CENTRE,
+    SEARCH,
+    Looks,
+    NoisyDrives,
+    Smoothing,
+)
 from mi_nerfattack.experiment.certify.robustness import (
     RobustnessSettings,
     certify_robustness,
@@ -128,6 +135,36 @@ def test_finished_drives_are_kept_and_more_are_added(scenario, certified):
     kept = {p: p.stat().st_mtime_ns for p in output.rglob("random_*.safetensors")}
     assert len(kept) == 14 and sum(before.get(p) == at for p, at in kept.items()) == 12
     assert wider["departed"] >= document["departed"]
+    # two numbers of runs are two looks, which lessen the confidence
+    assert document["looks"] == again["looks"] == [12] and document["flags"] == []
+    assert wider["looks"] == [12, 14]
+    assert len(wider["flags"]) == 1 and "12, 14 runs" in wider["flags"][0]
+    third = certify_robustness(scenario, output, SETTINGS, InThisProcess())
+    assert third["looks"] == [12, 14] and third["flags"] == wider["flags"]
+
+
+def test_no_start_has_the_random_numbers_of_a_noise(scenario, monkeypatch):
+    world = build_world(scenario, scenario.build_policy())
+    smoothing = Smoothing.of(world, "surrogate", Looks(world, 24), 0.5)
+    keys, own = [], np.random.default_rng
+
+    def recorded(key):
+        keys.append(key)
+        return own(key)
+
+    monkeypatch.setattr(np.random, "default_rng", recorded)
+    count = 2000
+    for purpose in (CENTRE, ATTACKED, SEARCH):
+        for number in range(count):
+            smoothing.draw(world, purpose, number)
+    streams = [tuple(np.random.SeedSequence(key).generate_state(4)) for key in keys]
+    assert len(set(streams)) == len(streams) == 2 * 3 * count
+
+
+def test_a_certificate_without_its_looks_is_refused(scenario, tmp_path):
+    files.write_json(tmp_path / "certificate.json", {"schema": 1})
+    with refused_at(tmp_path / "certificate.json", "looks"):
+        certify_robustness(scenario, tmp_path, SETTINGS, InThisProcess())
 
 
 def test_without_noise_it_is_the_drive_past_the_original_texture(scenario, tmp_path):
