@@ -119,7 +119,8 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     """Read the rows of a table; a row without digests gets empty ones."""
     kinds = dict.fromkeys(LABELS, str)
     stored = pd.read_csv(path, dtype=kinds, na_filter=False).to_dict("records")
-    return [dict.fromkeys(LABELS, "") | item for item in stored]
+    none = dict.fromkeys(LABELS, "")
+    return [none | {str(key): value for key, value in item.items()} for item in stored]
 
 
 def row(world: World, reach: Reach) -> dict[str, Any]:
