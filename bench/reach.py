@@ -16,6 +16,7 @@ import tyro
 from bench.results import progress
 from bench.tables import markdown, number
 from mi_nerfattack import variant
+from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.commands.shared.options import Settings
 from mi_nerfattack.commands.shared.terminal import Result
 from mi_nerfattack.errors import InputError
@@ -27,6 +28,9 @@ from mi_nerfattack.rollout.drive import departure_limit
 from mi_nerfattack.scenario.scenario import Scenario, load_scenario
 from mi_nerfattack.scenario.world import World, build_world
 
+#: Columns of the file that say what was measured: place, digest of the scenario and
+#: its files, and digest of the program.
+LABELS = ("place", "scenario", "source")
 #: Columns of the table, by the keys of a row.
 HEADS = {
     "place": "place",
@@ -50,6 +54,10 @@ class BenchReach:
     these frames (median and most, in the unit of the control), and the largest error
     of three drives from the nominal start: as the objects look, and with all frames'
     controls raised or lowered. A place takes a minute.
+
+    A table in a file continues: a place is not measured again if the file has a row of
+    it with the same scenario, as its digest in the file says. Otherwise the new row
+    replaces the old one.
     """
 
     file: tyro.conf.Positional[Path]
@@ -59,8 +67,7 @@ class BenchReach:
     settings: Settings = ()
     """Set a key of the scenario: drive.length_m=45. A grid sets keys itself."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Table (.csv), which a second run continues: places that it has are not measured
-    again."""
+    """Table (.csv), which a second run continues."""
     json: bool = False
     """Print one line of JSON in place of the table."""
 
@@ -71,15 +78,18 @@ class BenchReach:
         if self.output is not None:
             files.make_folder(self.output.parent)
             if self.output.exists():
-                rows = pd.read_csv(self.output).to_dict("records")
+                rows = read_rows(self.output)
         with progress() as show:
             for place, scenario in self._scenarios():
-                if any(item["place"] == place for item in rows):
+                labels = {"place": place, "scenario": scenario.digest()}
+                if any(labels.items() <= item.items() for item in rows):
                     continue
+                labels["source"] = versions()["source"]
                 world = build_world(scenario, scenario.build_policy())
                 on_step = partial(_shown, show, place, world.horizon)
                 figures = row(world, measure_reach(world, on_step=on_step))
-                rows.append({"place": place, **figures})
+                rows = [item for item in rows if item["place"] != place]
+                rows.append(labels | figures)
                 if self.output is not None:
                     text = pd.DataFrame(rows).to_csv(index=False, float_format="%.6g")
                     files.write_text(self.output, text)
@@ -103,6 +113,14 @@ class BenchReach:
 
 def _shown(show: Any, place: str, horizon: int, step: int) -> None:
     show(place, step + 1, horizon, "")
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Read the rows of a table; a row without digests gets empty ones."""
+    kinds = dict.fromkeys(LABELS, str)
+    stored = pd.read_csv(path, dtype=kinds, na_filter=False).to_dict("records")
+    none = dict.fromkeys(LABELS, "")
+    return [none | {str(key): value for key, value in item.items()} for item in stored]
 
 
 def row(world: World, reach: Reach) -> dict[str, Any]:
@@ -129,7 +147,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     """Return the table in Markdown."""
     cells = []
     for item in rows:
-        told = {k: v if isinstance(v, str) else number(v) for k, v in item.items()}
-        told["in_view"] = f"{item['in_view']} of {item['frames']}"
-        cells.append([told[key] for key in HEADS])
+        shown = {key: number(item[key]) for key in HEADS if key != "place"}
+        shown["in_view"] = f"{item['in_view']} of {item['frames']}"
+        cells.append([item["place"], *shown.values()])
     return markdown(list(HEADS.values()), cells)

@@ -173,22 +173,32 @@ def _cpu() -> str:
     return platform.processor() or platform.machine()
 
 
-def run_command(words: Sequence[str], capture: bool = False) -> str:
+def run_command(words: Sequence[str]) -> None:
     """Run ``mi-nerfattack``, or ``python -m bench``, in a process of its own.
 
     Args:
         words: of its command line; the first one is ``bench`` for a benchmark.
-        capture: return what it prints on standard output; without, return "".
 
     Raises:
         SystemExit: with its exit code, if it fails.
     """
+    if code := _run(words, stdout=None).returncode:
+        raise SystemExit(code if code > 0 else 1)
+
+
+def run_for_output(words: Sequence[str]) -> tuple[int, str]:
+    """Run a command as :func:`run_command` does, also one that may fail.
+
+    Returns:
+        Its exit code, and what it printed on standard output.
+    """
+    done = _run(words, stdout=subprocess.PIPE)
+    return done.returncode, done.stdout
+
+
+def _run(words: Sequence[str], stdout: int | None) -> subprocess.CompletedProcess[str]:
     is_bench, own = words[0] == "bench", ["mi-nerfattack", *words]
     print("$", shlex.join(words if is_bench else own), file=sys.stderr, flush=True)
     module = list(words) if is_bench else ["mi_nerfattack.cli", *words]
     command = [sys.executable, "-m", *module]
-    pipe = subprocess.PIPE if capture else None
-    done = subprocess.run(command, check=False, stdout=pipe, text=True)
-    if code := done.returncode:
-        raise SystemExit(code if code > 0 else 1)
-    return done.stdout or ""
+    return subprocess.run(command, check=False, stdout=stdout, text=True)

@@ -6,12 +6,13 @@ import json
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from os.path import relpath
 from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
 
-from bench.results import command_of, run_command, stamp
+from bench.results import command_of, run_command, run_for_output, stamp
 from bench.studies.pages import write_pages
 from bench.studies.plan import (
     ROOT,
@@ -25,6 +26,7 @@ from bench.studies.plan import (
 )
 from bench.tables import markdown, number
 from mi_nerfattack import variant
+from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.commands.shared.terminal import Result, say
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.sweep.summary import (
@@ -32,8 +34,14 @@ from mi_nerfattack.experiment.sweep.summary import (
     told_attacks,
     write_summary,
 )
-from mi_nerfattack.experiment.sweep.table import MADE_OF, RESULTS, read_table
+from mi_nerfattack.experiment.sweep.table import (
+    MADE_OF,
+    RESULTS,
+    read_made,
+    read_table,
+)
 from mi_nerfattack.io import files
+from mi_nerfattack.io.resumable import json_digest
 
 QUICK = "quick"
 SHARE = 0.1  # of the rows that a check makes again
@@ -90,9 +98,7 @@ class BenchResults:
     def _do(self, study: Study, take: bool = True) -> bool:
         """Make the rows of a study that are missing; False if a command failed."""
         try:
-            for item in read_plan().inputs:
-                if item.file in study.inputs and not (ROOT / item.file).exists():
-                    run_command(shlex.split(item.command))
+            _make_inputs(study)
             try:
                 for words in self._words(study, take and study.take):
                     run_command(words)
@@ -119,40 +125,77 @@ class BenchResults:
 
     def _quick(self, study: Study) -> Result:
         """Make the quick study without committed rows, and compare it with them."""
-        done = self._do(study, take=False)
-        made = read_table(study.work / RESULTS)
-        found = {"table": str(study.work / RESULTS), "cells": len(done_labels(made))}
+        fresh = study.model_copy(update={"name": _fresh_name(study.name)})
+        done, work = self._do(fresh, take=False), fresh.work
+        made = read_table(work / RESULTS)
+        found = {"table": str(work / RESULTS), "cells": len(done_labels(made))}
         if (stored := study.read()) is not None:
             found |= differences(stored, made)
-        own = {"table": str(study.work.relative_to(ROOT)), "finding": "attack"}
-        pages = write_pages([study.model_copy(update=own)], study.work, study.work)
+        own = {"table": str(work.relative_to(ROOT)), "finding": "attack"}
+        pages = write_pages([study.model_copy(update=own)], work, work)
         found["pages"] = [str(path) for path in pages]
         lines = [f"{name}: {value}" for name, value in found.items()]
         return Result(found, lambda: print(*lines, sep="\n"), int(not done))
 
     def _checked(self, studies: Sequence[Study]) -> Result:
-        """Make a tenth of each table again; the results are written next to it."""
+        """Make a tenth of each table again; the results are written next to it.
+
+        A study that fails gets a row with the reason, and its check.json stays.
+        """
         rows = {}
         for study in studies:
             table = study.read()
             if study.grid is None or table is None:
                 continue
-            names = drawn_rows(table, SHARE, self.seed)
-            words = ["reproduce", str(study.folder), *names, "--json"]
-            words += ["-o", str(RUNS / f"check-{study.name}-{self.seed}")]
-            if self.workers is not None:
-                words += ["--workers", str(self.workers)]
-            told = json.loads(run_command(words, capture=True))
-            rows[study.name] = _check_row(told["cells"], len(table), self.seed)
-            document = stamp(rows[study.name], command_of("results", self))
+            try:
+                row = _check_row(self._repeated(study, table), len(table), self.seed)
+            except InputError as err:
+                rows[study.name] = _check_row([], len(table), self.seed, str(err))
+                continue
+            rows[study.name] = row
+            document = stamp(row, command_of("results", self))
             files.write_json(study.folder / "check.json", document)
         head = ["study", "rows again", "of", "largest difference (m)"]
         lines = [
-            [name, str(row["rows"]), str(row["of"]), _shown(row["largest_m"])]
+            [name, str(row["rows"]), str(row["of"]), row["error"] or _shown(row)]
             for name, row in rows.items()
         ]
-        failed = any(row["failed"] for row in rows.values())
+        failed = any(row["failed"] or row["error"] for row in rows.values())
         return Result(rows, lambda: print(markdown(head, lines)), int(failed))
+
+    def _repeated(self, study: Study, table: pd.DataFrame) -> list[dict[str, Any]]:
+        """Make the drawn cells of a study again, and return how each one differs."""
+        _make_inputs(study)
+        names = drawn_rows(table, SHARE, self.seed)
+        place = RUNS / _fresh_name(f"check-{study.name}-{self.seed}", *names)
+        words = ["reproduce", str(study.folder), *names, "--json", "-o", str(place)]
+        if self.workers is not None:
+            words += ["--workers", str(self.workers)]
+        code, text = run_for_output(words)
+        try:  # a failed cell ends it with 1, after the document
+            return json.loads(text)["cells"]
+        except ValueError as err:
+            why = f"reproduce ended with {code}; its message is above"
+            raise InputError(why) from err
+
+
+def _make_inputs(study: Study) -> None:
+    """Make the files that a study reads and that are missing."""
+    for item in read_plan().inputs:
+        if item.file in study.inputs and not (ROOT / item.file).exists():
+            try:
+                run_command(shlex.split(item.command))
+            except SystemExit as err:
+                why = f"{item.file}: {item.command!r} ended with {err.code}"
+                raise InputError(why) from err
+
+
+def _fresh_name(name: str, *rows: str) -> str:
+    """Return the name of a folder that only these rows and this program use.
+
+    A sweep takes the complete cells of its folder, also those of an older program.
+    """
+    return f"{name}-{json_digest([versions(), rows])[:12]}"
 
 
 def refresh(study: Study) -> None:
@@ -178,8 +221,23 @@ def refresh(study: Study) -> None:
     if names and all((work / name).exists() for name in names):
         files.make_folder(study.folder)
         for name in names:
+            if name == MADE_OF:
+                files.write_json(study.folder / name, _portable_cells(study))
+                continue
             raw = files.read_bytes(work / name, files.MAX_TENSOR_BYTES)
             files.write_bytes(study.folder / name, raw)
+
+
+def _portable_cells(study: Study) -> dict[str, Any]:
+    """Return what the cells of a study are made of, without paths of this machine.
+
+    Paths of files in the checkout begin in the parent of the table's folder, as
+    `reproduce` reads them.
+    """
+    made, root = read_made(study.work), relpath(ROOT, study.folder.parent)
+    for about in made.values():
+        about["scenario"] = about["scenario"].replace(f'"{ROOT}/', f'"{root}/')
+    return made
 
 
 def drawn_rows(table: pd.DataFrame, share: float, seed: int) -> list[str]:
@@ -220,7 +278,17 @@ def differences(stored: pd.DataFrame, made: pd.DataFrame) -> dict[str, Any]:
     return {"compared": len(apart), "largest_m": largest}
 
 
-def _check_row(cells: Sequence[dict[str, Any]], of: int, seed: int) -> dict[str, Any]:
+def _check_row(
+    cells: Sequence[dict[str, Any]], of: int, seed: int, error: str | None = None
+) -> dict[str, Any]:
+    """Return a row of the check.
+
+    Args:
+        cells: of ``reproduce``.
+        of: number of the table's rows.
+        seed: of the draw.
+        error: why the study was not checked.
+    """
     known = [cell["largest_difference"] for cell in cells]
     errors = [largest[_ERROR] for largest in known if largest is not None]
     return {
@@ -231,6 +299,9 @@ def _check_row(cells: Sequence[dict[str, Any]], of: int, seed: int) -> dict[str,
         "of": of,
         "largest_m": max(errors, default=None),
         "failed": [cell["cell"] for cell in cells if cell["error"] is not None],
+        "changed_versions": {cell["cell"]: cell["versions"] for cell in cells},
+        "program": versions(),
+        "error": error,
     }
 
 
@@ -256,7 +327,8 @@ def _list_row(study: Study, one: State) -> list[str]:
     return [study.name, study.question, done, current, number(one.hours_left), each]
 
 
-def _shown(value: float | None) -> str:
+def _shown(row: dict[str, Any]) -> str:
+    value = row["largest_m"]
     return "none compared" if value is None else f"{value:g}"
 
 

@@ -245,7 +245,7 @@ def test_a_table_is_never_replaced_by_one_with_fewer_attacks(study, capsys):
 def test_a_run_takes_the_committed_rows_and_goes_on_after_a_failure(study, monkeypatch):
     calls = []
 
-    def fail(words, capture=False):
+    def fail(words):
         calls.append(words)
         raise SystemExit(1)
 
@@ -269,9 +269,9 @@ def test_a_run_takes_the_committed_rows_and_goes_on_after_a_failure(study, monke
 def test_a_check_writes_the_differences_next_to_the_table(study, monkeypatch, capsys):
     write(study.folder, table({"attack": [0.1] * 12}))
     largest = {"cross_track_mean_m": 0.25}
-    cell = {"cell": "c", "rows": 2, "unmatched": 0, "error": None}
+    cell = {"cell": "c", "rows": 2, "unmatched": 0, "error": None, "versions": {}}
     told = {"cells": [cell | {"largest_difference": largest}]}
-    monkeypatch.setattr(run, "run_command", lambda *a, **k: json.dumps(told))
+    monkeypatch.setattr(run, "run_for_output", lambda words: (0, json.dumps(told)))
     assert main(["results", "--check", "--seed", "5", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     stored = json.loads((study.folder / "check.json").read_text())
@@ -286,7 +286,9 @@ def test_a_check_writes_the_differences_next_to_the_table(study, monkeypatch, ca
 
 def test_quick_compares_with_the_committed_rows(study, monkeypatch, capsys):
     write(study.folder, table({"attack": [0.1, 0.2]}))
-    write(study.work, table({"attack": [0.1, 0.5, 0.7]}))
+    monkeypatch.setattr(run, "versions", dict)
+    made = study.model_copy(update={"name": run._fresh_name(study.name)})
+    write(made.work, table({"attack": [0.1, 0.5, 0.7]}))
     calls = []
     monkeypatch.setattr(run, "run_command", lambda words: calls.append(words))
     monkeypatch.setattr(run, "ROOT", study.work.parents[1])

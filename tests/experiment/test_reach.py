@@ -183,6 +183,23 @@ def test_a_table_of_places_goes_on(path, tmp_path, capsys):
     assert main(words) == 0 and output.stat().st_mtime_ns == begun
 
 
+def test_a_row_of_another_scenario_is_replaced(path, tmp_path, capsys):
+    output = tmp_path / "reach.csv"
+    words = ["reach", str(path), "-o", str(output), "--json", "--set"]
+    found = []
+    for horizon in (2, 3):
+        assert main([*words, f"drive.horizon={horizon}"]) == 0
+        (row,) = json.loads(capsys.readouterr().out)["places"]
+        assert row["frames"] == horizon and row["source"]
+        found.append(row["scenario"])
+    assert found[0] != found[1]
+    older = pd.read_csv(output).drop(columns=["scenario", "source"])
+    older.assign(frames=99).to_csv(output, index=False)  # by a program before digests
+    assert main([*words, "drive.horizon=3"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["places"]
+    assert row["frames"] == 3 and row["scenario"] == found[1]
+
+
 def test_what_belongs_to_the_other_kind_of_file_is_refused(path, tmp_path, capsys):
     grid = tmp_path / "grid.toml"
     grid.write_text(f'scenario = "{path}"\n')

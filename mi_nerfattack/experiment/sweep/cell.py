@@ -17,6 +17,7 @@ from mi_nerfattack.experiment.claim import claimed
 from mi_nerfattack.experiment.job import Job
 from mi_nerfattack.io import files, locks
 from mi_nerfattack.io.strict import parse_toml
+from mi_nerfattack.scenario.named_file import portable_text
 from mi_nerfattack.scenario.scenario import Scenario
 
 #: Folder of the cells, in that of the sweep.
@@ -78,10 +79,29 @@ class Cell:
         Raises:
             InputError: what it names is not usable here.
         """
-        try:
-            return Scenario.model_validate(parse_toml(self.id, self.text))
-        except ValidationError as err:  # it was valid where the cell was made
-            raise InputError(f"{self.id}: {err}; is a file missing here?") from err
+        return _scenario(self.id, self.text)
+
+
+def absolute_text(name: str, text: str, folder: Path) -> str:
+    """Return the scenario of a cell with absolute paths.
+
+    Args:
+        name: of the cell.
+        text: of its scenario.
+        folder: where relative paths begin.
+
+    Raises:
+        InputError: what the scenario names is not usable here.
+    """
+    return portable_text(_scenario(name, text, folder), text)
+
+
+def _scenario(name: str, text: str, folder: Path | None = None) -> Scenario:
+    context = None if folder is None else {"folder": folder}
+    try:
+        return Scenario.model_validate(parse_toml(name, text), context=context)
+    except ValidationError as err:  # it was valid where the cell was made
+        raise InputError(f"{name}: {err}; is a file missing here?") from err
 
 
 def folder_of(sweep: Path, cell: Cell) -> Path:

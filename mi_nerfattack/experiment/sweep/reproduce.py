@@ -13,11 +13,17 @@ import pandas as pd
 from mi_nerfattack.drives.table import records
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.claim import CHECKPOINT, EFFORT, SCENARIO
-from mi_nerfattack.experiment.sweep.cell import Cell, changed, folder_of
+from mi_nerfattack.experiment.sweep.cell import (
+    Cell,
+    absolute_text,
+    changed,
+    folder_of,
+)
 from mi_nerfattack.experiment.sweep.table import (
     LABELS,
     RESULTS,
     Row,
+    made_of_row,
     read_made,
     read_table,
 )
@@ -53,6 +59,8 @@ def read_replay(
 
     Args:
         folder: with ``results.csv`` and ``cells.json``; nothing else of it is read.
+            Relative paths of a cell begin in its parent, where the grid of a committed
+            table is.
         names: rows: their index, from 0, or CELL:ENVIRONMENT:CASE:RUN.
         count: of rows that are drawn besides.
         seed: of that.
@@ -72,7 +80,10 @@ def read_replay(
     indices = dict.fromkeys([*indices, *(whole[i] for i in sorted(drawn))])
     first = {table[i]["cell"]: table[i] for i in indices}
     made = read_made(folder)
-    cells = tuple(_cell(row, made[name]) for name, row in first.items())
+    cells = tuple(
+        _cell(row, made_of_row(made, folder, name), folder)
+        for name, row in first.items()
+    )
     versions = {name: about["versions"] for name, about in made.items()}
     return Replay(whole_table, tuple(indices), cells, versions)
 
@@ -221,12 +232,13 @@ def _find(path: Path, table: Sequence[Row], name: str) -> int:
     return index
 
 
-def _cell(row: Row, made: Mapping[str, Any]) -> Cell:
+def _cell(row: Row, made: Mapping[str, Any], folder: Path) -> Cell:
     """Return the cell of a row, as it was done; findings of its checks are told."""
     name, labels = row["cell"], {key: row[key] for key in LABELS[1:]}
     digests, text = dict(made["digests"]), made["scenario"]
     today = upgraded_text(name, text)
-    cell = Cell(**labels, text=today, digests=digests, anyway=True, name=name)
+    here = absolute_text(name, today, folder.resolve().parent)
+    cell = Cell(**labels, text=here, digests=digests, anyway=True, name=name)
     if today != text:  # of the first form, whose digest is made of other keys
         digests["scenario"] = cell.scenario.digest()
     if wrong := changed(cell):

@@ -127,7 +127,7 @@ def read_table(path: Path) -> pd.DataFrame:
     old = table.loc[table["environment"] == "deployment", "cell"]
     made = read_made(path.parent) if len(old) else {}
     for cell, rows in old.groupby(old):
-        scenario = parse_toml(cell, made[cell]["scenario"])
+        scenario = parse_toml(cell, made_of_row(made, path.parent, cell)["scenario"])
         name = upgraded_environment("deployment", scenario)
         table.loc[rows.index, "environment"] = name
     return with_total(table)
@@ -146,6 +146,25 @@ def read_made(folder: Path) -> dict[str, Any]:
         InputError: the file is missing or damaged.
     """
     return files.read_json(folder / MADE_OF)
+
+
+def made_of_row(made: Mapping[str, Any], folder: Path, cell: str) -> dict[str, Any]:
+    """Return what the cell of a row was made of.
+
+    Args:
+        made: of :func:`read_made`.
+        folder: of the table.
+        cell: of the row.
+
+    Raises:
+        InputError: `made` has no such cell.
+    """
+    if cell not in made:
+        raise InputError(
+            f"{folder / MADE_OF}: has no {cell}, which {RESULTS} has; copy both files "
+            "from the folder of one sweep"
+        )
+    return made[cell]
 
 
 def labels_of(cell: Cell) -> Row:

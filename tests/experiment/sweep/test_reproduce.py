@@ -203,6 +203,36 @@ def test_rows_that_cannot_be_repeated(swept, command, tmp_path):
         read_replay(tmp_path, ["0"])
 
 
+def test_relative_paths_of_a_cell_begin_in_the_parent_of_the_table(
+    swept, scenario_folder, tmp_path, monkeypatch
+):
+    """Of a committed table; the current folder does not count."""
+    _, copy, cell = swept
+    inputs = shutil.copytree(scenario_folder, tmp_path / "inputs")
+    table = shutil.copytree(copy, tmp_path / "bench" / "table")
+    made = read_made(table)
+    text = made[cell.id]["scenario"]
+    assert str(scenario_folder) in text
+    relative = text.replace(str(scenario_folder), "../inputs")
+    made[cell.id] |= {"scenario": relative}
+    files.write_json(table / "cells.json", made)
+    monkeypatch.chdir(table.parents[1])
+    [here] = read_replay(Path("bench/table"), ["0"]).cells
+    assert not changed(here) and "../" not in here.text
+    assert here.scenario.objects[0].field.path == inputs / "object.safetensors"
+
+
+def test_a_row_without_its_cell_is_refused(swept, tmp_path):
+    copy = shutil.copytree(swept[1], tmp_path / "copy")
+    path = copy / "results.csv"
+    files.write_json(copy / "cells.json", {})
+    with pytest.raises(InputError, match=swept[2].id):
+        read_replay(copy, ["0"])
+    path.write_text(path.read_text().replace(",mitsuba,", ",deployment,"))
+    with pytest.raises(InputError, match=rf"cells\.json: .*{swept[2].id}.*; copy"):
+        read_table(path)
+
+
 def test_a_row_of_the_first_form_is_read():
     """Its cell keeps its name, though the scenario's digest is made of other keys."""
     replay = read_replay(Path(__file__).parents[3] / "docs" / "table2", ["0"])
