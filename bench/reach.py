@@ -35,10 +35,10 @@ LABELS = ("place", "scenario", "source")
 HEADS = {
     "place": "place",
     "in_view": "frames in view",
-    "pixels": "pixels",
-    "most_pixels": "most",
-    "moved": "reach",
-    "most_moved": "most",
+    "pixels": "pixels, median",
+    "most_pixels": "largest",
+    "moved": "reach, median",
+    "most_moved": "largest",
     **{f"{name}_m": f"{name}, m" for name in DRIVES},
     "limit_m": "limit, m",
 }
