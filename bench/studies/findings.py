@@ -291,6 +291,7 @@ def transfer(drives: pd.DataFrame) -> Finding:
         one.mean().map(math.exp).unstack(sort=False) for one in (logs, without)
     )
     by_day = heat["day"].drop(SURROGATE)
+    bare = empty["day"].reindex(by_day.index)
     ends = {
         name: np.exp(found).tolist()
         for name in by_day.index
@@ -320,8 +321,8 @@ def transfer(drives: pd.DataFrame) -> Finding:
             "without objects",
         ],
         [
-            [str(n), f"{x:.2f}", ends_cell(ends.get(n), 2), f"{empty['day'][n]:.2f}"]
-            for n, x in by_day.items()
+            [str(n), f"{x:.2f}", ends_cell(ends.get(n), 2), f"{y:.2f}"]
+            for (n, x), y in zip(by_day.items(), bare, strict=True)
         ],
         lambda figure: draw_heat(figure, heat),
         "own = drives.query(\"case == 'attack' and condition == 'day'\")\n"
