@@ -9,6 +9,10 @@ from matplotlib.figure import Figure
 
 from mi_nerfattack.evaluation.summary import Interval
 
+HALF = 0.5  # of the error in the surrogate, and of the places
+#: Column of the mean distance from the lane centre.
+ERROR = "cross_track_mean_m"
+
 
 @dataclass(frozen=True)
 class Finding:

@@ -8,34 +8,42 @@ of their share lies above one half. A study with missing attacks claims nothing.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from bench.studies.charts import (
-    draw_heat,
     draw_places,
     draw_ratios,
     draw_searches,
     draw_shares,
 )
-from bench.studies.content import Finding, ends_cell, interval_words, metres
+from bench.studies.content import (
+    ERROR,
+    HALF,
+    Finding,
+    ends_cell,
+    interval_words,
+    metres,
+)
 from bench.studies.limits import limits
 from bench.studies.plan import Study, state
+from bench.studies.transfer import transfer
 from mi_nerfattack.drives.table import records, with_starts
 from mi_nerfattack.evaluation.pairs import compare
-from mi_nerfattack.evaluation.summary import interval, share_interval, summary
+from mi_nerfattack.evaluation.summary import (
+    Interval,
+    share_interval,
+    summary,
+)
 from mi_nerfattack.experiment.sweep.summary import GRADIENT
 from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, NO_OBJECT, RANDOM
 from mi_nerfattack.scenario.deployment import SURROGATE
 
-HALF = 0.5  # of the error in the surrogate, and of the places
 _BY_GRADIENT = ("attached", "open_loop", "single_frame")
 EQUAL = 0.8  # of the gradient's frames, from which on a search has an equal budget
-_ERROR = "cross_track_mean_m"
 _CASES = {
     NO_OBJECT: "no object",
     RANDOM: "random textures",
@@ -92,7 +100,7 @@ def attack(drives: pd.DataFrame) -> Finding:
     own = drives[drives["environment"] == where]
     by_case = {case: own[own["case"] == case] for case in _CASES}
     sides = by_case[ATTACK], by_case[BEST_RANDOM]
-    found, (count, is_shown) = compare(*sides, _ERROR), is_farther(*sides)
+    found, (count, is_shown) = compare(*sides, ERROR), is_farther(*sides)
     places = f"{count} of {found.attacks} places"
     title = (
         f"The attack moves the car farther than the worst random texture at {places}"
@@ -102,7 +110,7 @@ def attack(drives: pd.DataFrame) -> Finding:
     groups = summary(drives, ["environment", "case"], ["cell"])
     rows = [
         [
-            *(_CASES[row["case"]], row["environment"], f"{row[_ERROR]:.3f}"),
+            *(_CASES[row["case"]], row["environment"], f"{row[ERROR]:.3f}"),
             ends_cell(row["cross_track_mean_ci95_m"]),
             f"{row['attacks_out']}/{row['attacks']}",
         ]
@@ -110,30 +118,6 @@ def attack(drives: pd.DataFrame) -> Finding:
         if row["case"] in _CASES
     ]
     out = int(summary(by_case[ATTACK], ["case"], ["cell"])["attacks_out"].iloc[0])
-    threats = []
-    if found.ratio_ci95 is not None and found.ratio_ci95[0] <= 1:
-        threats.append(
-            "The interval of the ratio of the means contains 1, because few attacks "
-            "are much stronger than the others. So the title counts places."
-        )
-    cost = by_case[ATTACK]["frames"].max(), by_case[BEST_RANDOM]["frames"].max()
-    threats.append(
-        "The worst random texture is the one with the largest error in the surrogate. "
-        f"The random textures cost {cost[1]:,} frames, and the attack up to "
-        f"{cost[0]:,}. [The page about the gradient](gradient.md) compares at equal "
-        "cost."
-    )
-    routes = by_case[ATTACK].groupby("route", sort=False)["departed"].sum()
-    threats.append(
-        "Drives that leave the lane, by route: "
-        f"{', '.join(f'{route} {count}' for route, count in routes.items())}."
-    )
-    means = _by_place(by_case[ATTACK])
-    threats.append(
-        f"One place, {_name(means.idxmax())}, has a mean error of "
-        f"{means.max():.2f} m. The mean over the other places is "
-        f"{means.drop(means.idxmax()).mean():.2f} m."
-    )
     errors = pd.DataFrame({n: _by_place(by_case[case]) for case, n in _CASES.items()})
     errors.index = [_name(place) for place in errors.index]
     return Finding(
@@ -154,7 +138,39 @@ def attack(drives: pd.DataFrame) -> Finding:
         lambda figure: draw_places(figure, errors),
         f'deployed = drives[drives.environment == "{where}"]\n'
         'print(deployed.groupby(["route", "case"]).cross_track_mean_m.mean())',
-        tuple(threats),
+        tuple(_threats_to_attack(by_case, found.ratio_ci95)),
+    )
+
+
+def _threats_to_attack(
+    by_case: Mapping[str, pd.DataFrame], ratio_ci95: Interval
+) -> Iterator[str]:
+    """Yield what speaks against the finding about the attack.
+
+    Args:
+        by_case: drives in the deployment environment.
+        ratio_ci95: interval of the ratio of attack and worst random texture.
+    """
+    if ratio_ci95 is not None and ratio_ci95[0] <= 1:
+        yield (
+            "The interval of the ratio of the means contains 1, because few attacks "
+            "are much stronger than the others. So the title counts places."
+        )
+    own, random = by_case[ATTACK], by_case[BEST_RANDOM]
+    yield (
+        "The worst random texture is the one with the largest error in the surrogate. "
+        f"The random textures cost {random['frames'].max():,} frames, and the attack "
+        f"up to {own['frames'].max():,}. [The page about the gradient](gradient.md) "
+        "compares at equal cost."
+    )
+    left = own.groupby("route", sort=False)["departed"].sum()
+    counts = ", ".join(f"{route} {drives}" for route, drives in left.items())
+    yield f"Drives that leave the lane, by route: {counts}."
+    means = _by_place(own)
+    yield (
+        f"One place, {_name(means.idxmax())}, has a mean error of {means.max():.2f} m. "
+        "The mean over the other places is "
+        f"{means.drop(means.idxmax()).mean():.2f} m."
     )
 
 
@@ -163,7 +179,7 @@ def gradient(drives: pd.DataFrame) -> Finding:
     own = _attacks(drives)
     sides = {str(name): side for name, side in own.groupby("method", sort=False)}
     base = sides.pop(GRADIENT)
-    found = {name: compare(base, side, _ERROR) for name, side in sides.items()}
+    found = {name: compare(base, side, ERROR) for name, side in sides.items()}
     farther = {name: is_farther(base, side) for name, side in sides.items()}
     frames = own.groupby("method", sort=False)["frames"].mean()
     fair = {name: found[name] for name in found if _is_equal(frames, name)}
@@ -178,18 +194,6 @@ def gradient(drives: pd.DataFrame) -> Finding:
     )
     close, nearest = min(fair.items(), key=lambda item: item[1].ratio or 0.0)
     wins = [farther[name][0] for name in fair]
-    threats = [
-        f"`{name}` cost {frames[name]:.0f} frames and the gradient "
-        f"{frames[GRADIENT]:.0f}, so the comparison leaves this search out."
-        for name in found
-        if name not in fair
-    ]
-    places = own.groupby(["scenario", "seed", "method"])[_ERROR].mean().unstack()
-    behind = places[places[GRADIENT] < places[list(fair)].max(axis=1)]
-    threats += [
-        f"At {_name(place)}, another search is better: the gradient has {error:.2f} m."
-        for place, error in behind[GRADIENT].items()
-    ]
     rows = [
         [
             *(name, f"{frames[name]:.0f}", f"{effect.other:.3f}"),
@@ -220,18 +224,43 @@ def gradient(drives: pd.DataFrame) -> Finding:
             figure, {n: (e.ratio or 0.0, e.ratio_ci95) for n, e in found.items()}
         ),
         _OF_SEARCHES,
-        tuple(threats),
+        tuple(_threats_to_gradient(own, frames, list(fair))),
     )
+
+
+def _threats_to_gradient(
+    own: pd.DataFrame, frames: pd.Series, fair: list[str]
+) -> Iterator[str]:
+    """Yield what speaks against the finding about the gradient.
+
+    Args:
+        own: drives with the attack in the surrogate.
+        frames: mean number by search.
+        fair: searches of equal cost.
+    """
+    for name in own["method"].unique():
+        if name not in (GRADIENT, *fair):
+            yield (
+                f"`{name}` cost {frames[name]:.0f} frames and the gradient "
+                f"{frames[GRADIENT]:.0f}, so the comparison leaves this search out."
+            )
+    places = own.groupby(["scenario", "seed", "method"])[ERROR].mean().unstack()
+    behind = places[places[GRADIENT] < places[fair].max(axis=1)]
+    for place, error in behind[GRADIENT].items():
+        yield (
+            f"At {_name(place)}, another search is better: the gradient has "
+            f"{error:.2f} m."
+        )
 
 
 def searches(drives: pd.DataFrame) -> Finding:
     """Rank the searches by the geometric mean of their attacks over the routes."""
     own = _attacks(drives)
-    errors = own.groupby(["method", "route"], sort=False)[_ERROR].mean().unstack()
+    errors = own.groupby(["method", "route"], sort=False)[ERROR].mean().unstack()
     rank = errors.dropna().map(math.log).mean(axis=1).map(math.exp)
     best = str(rank.idxmax())
     title = f"Of {len(rank)} searches, `{best}` moves the car farthest"
-    spread = own.groupby("cell")[_ERROR].std().mean()
+    spread = own.groupby("cell")[ERROR].std().mean()
     return Finding(
         title,
         (
@@ -273,7 +302,7 @@ def flat(drives: pd.DataFrame) -> Finding:
         ),
         ["picture", "mean error (m)", "drives that leave the lane"],
         [
-            [_CASES[case], f"{groups[_ERROR][case]:.3f}", f"{left[case]}/{count[case]}"]
+            [_CASES[case], f"{groups[ERROR][case]:.3f}", f"{left[case]}/{count[case]}"]
             for case in groups.index
         ],
         lambda figure: draw_shares(
@@ -282,73 +311,6 @@ def flat(drives: pd.DataFrame) -> Finding:
         'lit = drives[drives.environment == "built_in"]\n'
         'print(lit.groupby(["objects", "case"]).departed.mean())',
     )
-
-
-def transfer(drives: pd.DataFrame) -> Finding:
-    """Compare each environment and condition with the surrogate by day."""
-    logs, without = (_to_surrogate(drives, case) for case in (ATTACK, NO_OBJECT))
-    heat, empty = (
-        one.mean().map(math.exp).unstack(sort=False) for one in (logs, without)
-    )
-    by_day = heat["day"].drop(SURROGATE)
-    bare = empty["day"].reindex(by_day.index)
-    ends = {
-        name: np.exp(found).tolist()
-        for name in by_day.index
-        if (found := interval(np.mean, (logs[name]["day"].to_numpy(),), 0)) is not None
-    }
-    kept = sum(low > HALF for low, _ in ends.values())
-    lost = sum(high < HALF for _, high in ends.values())
-    count = len(by_day)
-    title = (
-        f"Attacks keep more than half of their error in {kept} of {count} "
-        f"environments, and less than half in {lost}"
-    )
-    return Finding(
-        title,
-        (
-            f"By day, the error with the attack is {by_day.max():.2f} times the error "
-            f"in the surrogate in `{by_day.idxmax()}`, and {by_day.min():.2f} times in "
-            f"`{by_day.idxmin()}`.",
-            f"In {count - kept - lost} environments, the 95 % interval of this ratio "
-            "contains one half.",
-            f"These are geometric means over {len(logs)} places with "
-            f"{drives['attack'].nunique()} attacks, and attacks at one place count as "
-            "one value.",
-        ),
-        [
-            *("environment, by day", "error to the surrogate's", "95 % interval"),
-            "without objects",
-        ],
-        [
-            [str(n), f"{x:.2f}", ends_cell(ends.get(n), 2), f"{y:.2f}"]
-            for (n, x), y in zip(by_day.items(), bare, strict=True)
-        ],
-        lambda figure: draw_heat(figure, heat),
-        "own = drives.query(\"case == 'attack' and condition == 'day'\")\n"
-        'print(own.pivot_table("cross_track_mean_m", "environment", "route"))',
-        (
-            "Grey cells of the chart are not driven. The labels are those of "
-            "[transfer](../transfer.md).",
-        ),
-    )
-
-
-def _to_surrogate(drives: pd.DataFrame, case: str) -> pd.DataFrame:
-    """Divide errors by the error with the attack in the surrogate by day.
-
-    Returns:
-        Mean logarithms of a place (row), by environment and condition.
-    """
-    rows, columns = ["route", "attack"], ["environment", "condition"]
-    table, attacks = (
-        drives[drives["case"] == name].pivot_table(_ERROR, rows, columns, sort=False)
-        for name in (case, ATTACK)
-    )
-    logs = table.div(attacks[SURROGATE]["day"], axis=0).map(math.log)
-    # The name of an attack ends with the seed of its place and a digest
-    seeds = logs.index.get_level_values("attack").str.split("-").str[-2]
-    return logs.groupby([logs.index.get_level_values("route"), seeds]).mean()
 
 
 #: By the name of the page: what is not known while attacks are missing, and the rest.
@@ -380,4 +342,4 @@ def _is_equal(frames: pd.Series, name: str) -> bool:
 
 def _by_place(drives: pd.DataFrame) -> pd.Series:
     """Return the mean error by scenario and seed, metres."""
-    return drives.groupby(["scenario", "seed"], sort=False)[_ERROR].mean()
+    return drives.groupby(["scenario", "seed"], sort=False)[ERROR].mean()

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import tyro
+from rich.console import RenderableType
 
 from mi_nerfattack.commands.shared.options import Settings
+from mi_nerfattack.commands.shared.progress import StageBars
 from mi_nerfattack.commands.shared.terminal import Result, console
 
 
@@ -59,7 +63,6 @@ class CertifyRobustness:
     def run(self) -> Result:
         """Drive, search, bound, write and print."""
         from mi_nerfattack import variant
-        from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.experiment.certify.robustness import (
             RobustnessSettings,
             certify_robustness,
@@ -87,22 +90,11 @@ class CertifyRobustness:
         alone = isinstance(scenario.policy, HttpSection)
         workers = chosen_workers(self.workers, alone)
         with StageBars() as bars:
-
-            def show(stage: str, done: int, total: int) -> None:
-                bars.show(stage, done, total, f"{done}/{total}")
-
             document = certify_robustness(
-                scenario, self.output, settings, workers, show
+                scenario, self.output, settings, workers, partial(_show, bars)
             )
-
-        def tell() -> None:
-            out = console()
-            out.print(robustness_table(document))
-            for line in document["flags"]:
-                out.print(f"flag: {line}", highlight=False)
-            out.print(f"Written: {self.output.resolve()}", soft_wrap=True)
-
-        return Result(document, tell)
+        lines = [f"flag: {line}" for line in document["flags"]]
+        return _result(document, robustness_table(document), lines, self.output)
 
 
 @dataclass(frozen=True)
@@ -135,7 +127,6 @@ class CertifyGradient:
     def run(self) -> Result:
         """Drive, compare, write and print."""
         from mi_nerfattack import variant
-        from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.experiment.certify.gradient import (
             certify_gradient,
             sentences,
@@ -148,24 +139,32 @@ class CertifyGradient:
         variant.ensure()
         workers = chosen_workers(self.workers, alone=False)
         with StageBars() as bars:
-
-            def show(stage: str, done: int, total: int) -> None:
-                bars.show(stage, done, total, f"{done}/{total}")
-
             document = certify_gradient(
                 self.run_folder,
                 self.output,
                 directions=self.directions,
                 step=self.step,
                 workers=workers,
-                on_stage=show,
+                on_stage=partial(_show, bars),
             )
+        table = gradient_table(document)
+        return _result(document, table, sentences(document), self.output)
 
-        def tell() -> None:
-            out = console()
-            out.print(gradient_table(document))
-            for line in sentences(document):
-                out.print(line, highlight=False)
-            out.print(f"Written: {self.output.resolve()}", soft_wrap=True)
 
-        return Result(document, tell)
+def _show(bars: StageBars, stage: str, done: int, total: int) -> None:
+    bars.counter(stage)(done, total)
+
+
+def _result(
+    document: dict[str, Any], table: RenderableType, lines: Sequence[str], output: Path
+) -> Result:
+    """Return a document with what a terminal shows of it: a table, then lines."""
+
+    def tell() -> None:
+        out = console()
+        out.print(table)
+        for line in lines:
+            out.print(line, highlight=False)
+        out.print(f"Written: {output.resolve()}", soft_wrap=True)
+
+    return Result(document, tell)

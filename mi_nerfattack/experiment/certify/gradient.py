@@ -32,9 +32,9 @@ from mi_nerfattack.experiment.certify.robustness import (
     SCHEMA,
     TABLE,
     OnStage,
-    check_folder,
+    certificate_folder,
 )
-from mi_nerfattack.io import files, locks
+from mi_nerfattack.io import files
 from mi_nerfattack.io.resumable import Record, Unit
 from mi_nerfattack.report.plots.certificate import plot_gradient
 from mi_nerfattack.scenario.scenario import Scenario
@@ -167,9 +167,7 @@ def certify_gradient(
             f"--directions, --step: {directions}, {step}; at least 3, and more than 0"
         )
     scenario = scenario_of(run)
-    with locks.claimed(output):
-        check_folder(output, DIFFERENCES, DIFFERENCES_TABLE)
-        locks.remove_partial(output)
+    with certificate_folder(output, DIFFERENCES, DIFFERENCES_TABLE):
         ended = Ended.of(run, scenario)
         identity = {**versions(), **scenario.identity(), "step": f"{step}"}
         identity["best"] = ended.digest

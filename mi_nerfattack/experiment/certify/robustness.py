@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -214,9 +215,7 @@ def certify_robustness(
         InputError: a file is missing or wrong, textures may not change, there is no
             such environment, or another process works in the folder.
     """
-    with locks.claimed(output):
-        check_folder(output, DRIVES, DRIVES_TABLE)
-        locks.remove_partial(output)
+    with certificate_folder(output, DRIVES, DRIVES_TABLE):
         evaluated = _evaluated(output)
         if settings.runs not in evaluated:
             evaluated.append(settings.runs)
@@ -231,29 +230,41 @@ def certify_robustness(
             centre, direction = job.centre()
             points = job.search(direction)
             attacked = job.attacked(points)
-        departed, confidence = job.departed(centre), settings.confidence
-        bound = chance_bound(departed, len(centre), confidence)
-        radii = zip(settings.radii, points, attacked, strict=True)
-        document = {
-            "schema": SCHEMA,
-            "scenario": scenario.name,
-            "seed": scenario.seed,
-            "settings": asdict(settings) | {"radii": list(settings.radii)},
-            "looks": evaluated,
-            "flags": _flags(evaluated, confidence),
-            "coefficients": looks.count,
-            "departure_limit_m": job.lane.wheel_m,
-            "departed": departed,
-            "chance": departed / len(centre),
-            "chance_interval": [*chance_interval(departed, len(centre), confidence)],
-            "chance_bound": bound,
-            "drive_s": float(np.median([item.wall_s for item in centre])),
-            "rows": [
-                job.row(radius, bound, point, found) for radius, point, found in radii
-            ],
-        }
+        document = _document(job, evaluated, centre, points, attacked)
         _write(output, document, job, centre, attacked)
     return document
+
+
+def _document(
+    job: _Job,
+    evaluated: list[int],
+    centre: Sequence[Finished],
+    points: Sequence[np.ndarray],
+    attacked: Sequence[tuple[list[Finished], list[Finished]]],
+) -> dict[str, Any]:
+    """Summarise drives."""
+    settings, scenario = job.settings, job.world.scenario
+    departed, confidence = job.departed(centre), settings.confidence
+    bound = chance_bound(departed, len(centre), confidence)
+    radii = zip(settings.radii, points, attacked, strict=True)
+    return {
+        "schema": SCHEMA,
+        "scenario": scenario.name,
+        "seed": scenario.seed,
+        "settings": asdict(settings) | {"radii": list(settings.radii)},
+        "looks": evaluated,
+        "flags": _flags(evaluated, confidence),
+        "coefficients": job.looks.count,
+        "departure_limit_m": job.lane.wheel_m,
+        "departed": departed,
+        "chance": departed / len(centre),
+        "chance_interval": [*chance_interval(departed, len(centre), confidence)],
+        "chance_bound": bound,
+        "drive_s": float(np.median([item.wall_s for item in centre])),
+        "rows": [
+            job.row(radius, bound, point, found) for radius, point, found in radii
+        ],
+    }
 
 
 def _evaluated(output: Path) -> list[int]:
@@ -286,21 +297,28 @@ def _flags(evaluated: Sequence[int], confidence: float) -> list[str]:
     ]
 
 
-def check_folder(output: Path, *names: str) -> None:
-    """Refuse a folder that holds something else than a certificate.
+@contextmanager
+def certificate_folder(output: Path, *names: str) -> Iterator[None]:
+    """Claim the folder of a certificate, and remove what was half written.
 
     Args:
         output: the folder.
         names: of files and folders that only this kind of certificate has.
+
+    Raises:
+        InputError: it holds something else, or another process works in it.
     """
     own = {*names, DOCUMENT, TABLE, PICTURE}
     own |= {str(Path(PICTURE).with_suffix(suffix)) for suffix in (".pdf", ".svg")}
-    others = {p.name for p in output.iterdir() if not locks.is_partial(p)} - own
-    if others:
-        raise InputError(
-            f"{output}: holds something else than such a certificate, for example "
-            f"{min(others)}; choose another folder"
-        )
+    with locks.claimed(output):
+        others = {p.name for p in output.iterdir() if not locks.is_partial(p)} - own
+        if others:
+            raise InputError(
+                f"{output}: holds something else than such a certificate, for example "
+                f"{min(others)}; choose another folder"
+            )
+        locks.remove_partial(output)
+        yield
 
 
 def _write(

@@ -1,0 +1,81 @@
+"""The finding about transfer: what attacks keep in other environments."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+
+from bench.studies.charts import draw_heat
+from bench.studies.content import ERROR, HALF, Finding, ends_cell
+from mi_nerfattack.evaluation.summary import interval
+from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT
+from mi_nerfattack.scenario.deployment import SURROGATE
+
+
+def transfer(drives: pd.DataFrame) -> Finding:
+    """Compare each environment and condition with the surrogate by day."""
+    logs, without = (_to_surrogate(drives, case) for case in (ATTACK, NO_OBJECT))
+    heat, empty = (
+        one.mean().map(math.exp).unstack(sort=False) for one in (logs, without)
+    )
+    by_day = heat["day"].drop(SURROGATE)
+    bare = empty["day"].reindex(by_day.index)
+    ends = {
+        name: np.exp(found).tolist()
+        for name in by_day.index
+        if (found := interval(np.mean, (logs[name]["day"].to_numpy(),), 0)) is not None
+    }
+    kept = sum(low > HALF for low, _ in ends.values())
+    lost = sum(high < HALF for _, high in ends.values())
+    count = len(by_day)
+    title = (
+        f"Attacks keep more than half of their error in {kept} of {count} "
+        f"environments, and less than half in {lost}"
+    )
+    return Finding(
+        title,
+        (
+            f"By day, the error with the attack is {by_day.max():.2f} times the error "
+            f"in the surrogate in `{by_day.idxmax()}`, and {by_day.min():.2f} times in "
+            f"`{by_day.idxmin()}`.",
+            f"In {count - kept - lost} environments, the 95 % interval of this ratio "
+            "contains one half.",
+            f"These are geometric means over {len(logs)} places with "
+            f"{drives['attack'].nunique()} attacks, and attacks at one place count as "
+            "one value.",
+        ),
+        [
+            *("environment, by day", "error to the surrogate's", "95 % interval"),
+            "without objects",
+        ],
+        [
+            [str(n), f"{x:.2f}", ends_cell(ends.get(n), 2), f"{y:.2f}"]
+            for (n, x), y in zip(by_day.items(), bare, strict=True)
+        ],
+        lambda figure: draw_heat(figure, heat),
+        "own = drives.query(\"case == 'attack' and condition == 'day'\")\n"
+        'print(own.pivot_table("cross_track_mean_m", "environment", "route"))',
+        (
+            "Grey cells of the chart are not driven. The labels are those of "
+            "[transfer](../transfer.md).",
+        ),
+    )
+
+
+def _to_surrogate(drives: pd.DataFrame, case: str) -> pd.DataFrame:
+    """Divide errors by the error with the attack in the surrogate by day.
+
+    Returns:
+        Mean logarithms of a place (row), by environment and condition.
+    """
+    rows, columns = ["route", "attack"], ["environment", "condition"]
+    table, attacks = (
+        drives[drives["case"] == name].pivot_table(ERROR, rows, columns, sort=False)
+        for name in (case, ATTACK)
+    )
+    logs = table.div(attacks[SURROGATE]["day"], axis=0).map(math.log)
+    # The name of an attack ends with the seed of its place and a digest
+    seeds = logs.index.get_level_values("attack").str.split("-").str[-2]
+    return logs.groupby([logs.index.get_level_values("route"), seeds]).mean()
