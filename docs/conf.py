@@ -53,11 +53,11 @@ highlight_language = "none"
 
 
 # Pages whose lists of links are the table of contents.
-CONTENTS = ("index", "tutorials/index", "findings/index")
+CONTENTS = ("index", "tutorials/index", "results/findings/index")
 # The site shows these files as pages; in the repository a page links to each.
 CARDS = {
-    "pilotnet": "../scenes/policy/pilotnet.md",
-    "room_policy": "../scenes/room/policy.md",
+    "results/pilotnet": "scenes/policy/pilotnet.md",
+    "results/room_policy": "scenes/room/policy.md",
 }
 
 
@@ -65,9 +65,9 @@ def _for_the_site(app: Sphinx, page: str, text: list[str]) -> None:
     """Turn a page that reads well in the repository into a page of the site."""
     del app
     if page in CARDS:
-        text[0] = f"```{{include}} {CARDS[page]}\n:relative-images:\n```\n"
+        text[0] = f"```{{include}} ../../{CARDS[page]}\n:relative-images:\n```\n"
     for name, card in CARDS.items():
-        text[0] = text[0].replace(f"({card})", f"({name}.md)")
+        text[0] = re.sub(rf"\((?:\.\./)+{card}\)", f"(/{name}.md)", text[0])
     if page in CONTENTS:
         text[0] += "".join(_toctrees(text[0]))
 

@@ -2,8 +2,8 @@
 
     python docs/generate.py
 
-docs/examples.md shows files of docs/examples/. docs/faults.md shows the tables of the
-suite in tests/faults. docs/plugin_reference.md shows the class
+docs/examples.md shows files of docs/examples/. docs/reference/faults.md shows the tables of the
+suite in tests/faults. docs/reference/plugins.md shows the class
 docstrings of plugins/*.py, which are reStructuredText in the format of Mitsuba's plugin
 reference. No plugin is imported. tests/docs/test_generated.py compares the pages with
 the files.
@@ -46,8 +46,8 @@ PROLOG = "\n".join(
 
 def pages() -> dict[Path, str]:
     """Return the text that each of the pages should have."""
-    examples, reference = DOCS / "examples.md", DOCS / "plugin_reference.md"
-    faults = DOCS / "faults.md"
+    examples, reference = DOCS / "examples.md", DOCS / "reference/plugins.md"
+    faults = DOCS / "reference/faults.md"
     head = reference.read_text("utf-8").partition(MARK)[0]
     return {
         examples: with_files(examples.read_text("utf-8")),
@@ -106,7 +106,7 @@ def plugin_reference() -> str:
             title, *body = section.children
             heading = inline(title)
             anchor = re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-")
-            picture = f"![Picture of {source.stem}](pictures/plugin_{source.stem}.jpg)"
+            picture = f"![Picture of {source.stem}](../pictures/plugin_{source.stem}.jpg)"
             contents.append(f"- [{heading}](#{anchor})")
             parts = [part for node in body for part in block(node)]
             sections += [f"## {heading}", picture, *parts]

@@ -1,6 +1,6 @@
 """List the sentences, phrases and lines of a page that break the plain voice.
 
-    python docs/voice.py docs/install.md README.md
+    python docs/voice.py docs/start/install.md README.md
 
 Each finding is printed with its page and line. The rules: a sentence has at most 35
 words, a line at most 100 characters, no phrase is one of PHRASES, and only pages of
@@ -67,7 +67,7 @@ _MACHINES = re.compile(
     r"\b(?:AMD|EPYC|Xeon|Ryzen|Threadripper|Intel Core|Core i\d|Graviton|Apple M\d"
     r"|[AHV][12]00|RTX \w+|GTX \w+|Tesla [A-Z]\d+)\b"
 )
-_RESULTS = ("docs/bench.md", "docs/table2/", "docs/methods/", "docs/matrix/")
+_RESULTS = ("docs/results/bench.md", "docs/results/table2/", "docs/results/methods/", "docs/results/matrix/")
 
 _SENTENCE_END = re.compile(r"(?<!\.\.)[.!?][)\]\"'”’*]*\s+")
 _ABBREVIATION = re.compile(r"\b(?:e\.g|i\.e|cf|vs|approx|et al|Fig|Eq|Sec)\.\s+$")

@@ -106,7 +106,7 @@ def test_an_import_adds_little_to_that_of_mitsuba():
 
 
 @pytest.mark.parametrize(
-    "path", sorted((ROOT / "docs").glob("*.md")), ids=lambda path: path.stem
+    "path", sorted((ROOT / "docs").rglob("*.md")), ids=lambda path: path.stem
 )
 def test_what_the_documentation_imports_is_there(path):
     imports = r"^from mi_nerfattack\S* import (?:\([^)]*\)|.+)$"

@@ -1,4 +1,4 @@
-"""The charts of docs/findings; each function draws in an empty figure."""
+"""The charts of docs/results/findings; each function draws in an empty figure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a page of docs/findings shows."""
+"""What a page of docs/results/findings shows."""
 
 from __future__ import annotations
 

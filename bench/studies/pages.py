@@ -1,4 +1,4 @@
-"""Write the pages of docs/findings."""
+"""Write the pages of docs/results/findings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mi_nerfattack.io import files
 from mi_nerfattack.report.plots.charts import blank, png
 
 MARK = "<!-- python -m bench results --pages writes this page from the table. -->"
-FOLDER = ROOT / "docs/findings"
+FOLDER = ROOT / "docs/results/findings"
 _SIZE_IN, _DPI = (8.0, 3.4), 100
 
 

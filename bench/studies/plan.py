@@ -65,7 +65,7 @@ class Study(Section):
     inputs: tuple[str, ...] = ()  # files of [[inputs]]
     report: str | None = None  # command that writes the figures of a page
     pages: tuple[str, ...] = ()  # that quote the table
-    finding: str | None = None  # name of the page in docs/findings
+    finding: str | None = None  # name of the page in docs/results/findings
     threats: tuple[str, ...] = ()
     note: str = ""  # one more sentence of the page
 

@@ -55,7 +55,7 @@ class BenchResults:
 
     Each study calls sweep, transfer or retrain in runs/results/NAME, and the same
     command continues after Ctrl-C. At the end of a study its committed table and its
-    page in docs/findings are written again.
+    page in docs/results/findings are written again.
     """
 
     continues: ClassVar[bool] = True
@@ -70,7 +70,7 @@ class BenchResults:
     """Make the smallest study (one town, one route, two seeds) as in a fresh clone,
     and compare it with the committed rows. No committed file changes."""
     pages: bool = False
-    """Only write the pages of docs/findings again."""
+    """Only write the pages of docs/results/findings again."""
     seed: int = 0
     """Of the rows that --check draws."""
     workers: int | None = None

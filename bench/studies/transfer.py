@@ -59,7 +59,7 @@ def transfer(drives: pd.DataFrame) -> Finding:
         'print(own.pivot_table("cross_track_mean_m", "environment", "route"))',
         (
             "Grey cells of the chart are not driven. The labels are those of "
-            "[transfer](../transfer.md).",
+            "[transfer](../../howto/transfer.md).",
         ),
     )
 

@@ -40,7 +40,7 @@ def test_carla_by_name(server):
     assert server.is_as_before
 
 
-DOCS = Path(__file__).parents[2] / "docs" / "environments.md"
+DOCS = Path(__file__).parents[2] / "docs" / "howto/environments.md"
 
 
 def documented(heading: str) -> str:

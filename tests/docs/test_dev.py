@@ -64,7 +64,7 @@ def test_the_picture_shows_the_folders_in_their_order():
 
 def test_every_page_is_in_the_contents():
     docs = ROOT / "docs"
-    names = ("index.md", "tutorials/index.md", "findings/index.md")
+    names = ("index.md", "tutorials/index.md", "results/findings/index.md")
     contents = [docs / name for name in names]
     listed = {
         (page.parent / name).resolve()
@@ -86,7 +86,7 @@ def test_every_package_with_public_names_is_in_the_reference():
     assert documented == names | {"mi_nerfattack"}
 
 
-NAMED = re.findall(r"`(tests/[^`]*)`", (ROOT / "docs/faults.md").read_text("utf-8"))
+NAMED = re.findall(r"`(tests/[^`]*)`", (ROOT / "docs/reference/faults.md").read_text("utf-8"))
 TESTS = sorted({name for name in NAMED if "::" in name})
 
 
@@ -110,7 +110,7 @@ def test_a_named_test_is_there(name):
 
 
 def test_every_row_names_a_test():
-    page = (ROOT / "docs/faults.md").read_text("utf-8").partition(MARK)[0]
+    page = (ROOT / "docs/reference/faults.md").read_text("utf-8").partition(MARK)[0]
     rows = re.findall(r"^\|(.*)\|$", page, re.M)
     promises = [row for row in rows if not re.fullmatch(r"[-|]+|.* shown by ", row)]
     assert len(promises) > 30

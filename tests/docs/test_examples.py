@@ -50,7 +50,7 @@ def test_examples_are_short(script):
 
 def test_tables_user(tmp_path):
     *means, worst = printed("tables_user", tmp_path)
-    page = (DOCS / "table2" / "README.md").read_text("utf-8")
+    page = (DOCS / "results/table2/README.md").read_text("utf-8")
     _, _, page = page.partition("## mitsuba")
     header = next(x for x in page.splitlines() if x.startswith("| route |"))
     column = [name.strip() for name in header.split("|")].index("attack")
@@ -132,7 +132,7 @@ def test_the_xml_shows_both_fields(monkeypatch):
 
 def test_attacks_beat_every_random_texture_on_average():
     """At each place, in deployment; only on the left turn a wheel is out for 1 s."""
-    table = read_table(ROOT / "docs/table2/results.csv")
+    table = read_table(ROOT / "docs/results/table2/results.csv")
     driven = table[table["environment"] == "mitsuba"]
     cases = driven.groupby(["route", "seed", "case"])
     means = cases["cross_track_mean_m"].mean().unstack("case")
@@ -225,7 +225,7 @@ def test_mistakes_are_told(tmp_path, old, new, end):
 
 @pytest.mark.slow
 def test_blocks_of_the_guide_to_the_loop_run(tmp_path):
-    scripts = blocks("python", "docs/loop.md")
+    scripts = blocks("python", "docs/howto/loop.md")
     lines = run(tmp_path, "-c", "\n".join(scripts))
     assert len(scripts) == 4 and len(lines) == 2
 

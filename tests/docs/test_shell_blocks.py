@@ -19,8 +19,7 @@ from mi_nerfattack import cli
 from mi_nerfattack.commands import COMMANDS, each
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-TUTORIALS = sorted((ROOT / "docs/tutorials").glob("*.md"))
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 RUN = {
     "mi-nerfattack render frame scenes/intersection/field.xml -o hydrant.exr",
     "mi-nerfattack render frame scenes/intersection/field.xml -o hydrant.png \\",
@@ -33,15 +32,17 @@ INPUT = "takes files of the user's, or a folder that minutes to hours of work ma
 LONG = "takes more than a minute"
 USAGE = "shows what may be given, in words that stand for it"
 SKIPPED = {
-    **dict.fromkeys("README bench certify index policy".split(), LONG),
-    **dict.fromkeys("refine room training your_policy".split(), LONG),
-    **dict.fromkeys("attack sweep".split(), USAGE),
-    **dict.fromkeys("examples fields place render report".split(), INPUT),
-    **dict.fromkeys("retrain transfer view".split(), INPUT),
-    "commands": "writes into the home folder",
-    "environments": "takes CARLA's server, or more than a minute",
-    "install": "installs",
-    "robot": "takes a run, a camera, a tracker or a car",
+    **dict.fromkeys("README index howto/certify howto/policy".split(), LONG),
+    **dict.fromkeys("howto/training howto/your_policy".split(), LONG),
+    **dict.fromkeys("reference/room results/bench results/refine".split(), LONG),
+    **dict.fromkeys("howto/attack howto/sweep".split(), USAGE),
+    **dict.fromkeys("examples howto/fields howto/place".split(), INPUT),
+    **dict.fromkeys("howto/render howto/report howto/retrain".split(), INPUT),
+    **dict.fromkeys("howto/transfer howto/view".split(), INPUT),
+    "car/index": "takes a run, a camera, a tracker or a car",
+    "howto/environments": "takes CARLA's server, or more than a minute",
+    "reference/commands": "writes into the home folder",
+    "start/install": "installs",
 }
 
 
@@ -56,6 +57,11 @@ def blocks(page: Path, languages: tuple[str, ...] = ("",)) -> list[str]:
     ]
 
 
+def name(page: Path) -> str:
+    """Return the path of a page below docs, without its ending."""
+    return re.sub(r"^docs/", "", page.relative_to(ROOT).with_suffix("").as_posix())
+
+
 def commands(text: str) -> list[list[str]]:
     """Split the calls of a block into words, without what the shell does to them."""
     joined = re.sub(r"\\\n\s*", " ", text)
@@ -65,8 +71,8 @@ def commands(text: str) -> list[list[str]]:
 
 
 CALLS = [
-    pytest.param(words, id=f"{page.stem}-{k}-{words[0]}")
-    for page in [*PAGES, *TUTORIALS]
+    pytest.param(words, id=f"{name(page)}-{k}-{words[0]}")
+    for page in PAGES
     for k, words in enumerate(
         words for text in blocks(page, ("", "bash")) for words in commands(text)
     )
@@ -85,9 +91,9 @@ def test_commands_parse(words):
 
 
 def test_every_block_is_run_or_has_a_reason():
-    first = {page.stem: {x.split("\n")[0] for x in blocks(page)} for page in PAGES}
+    first = {name(page): {x.split("\n")[0] for x in blocks(page)} for page in PAGES}
     assert set().union(*first.values()) >= RUN
-    assert {name for name, found in first.items() if found - RUN} == set(SKIPPED)
+    assert {page for page, found in first.items() if found - RUN} == set(SKIPPED)
 
 
 @pytest.mark.slow

@@ -1,7 +1,7 @@
 """Commands that can be disturbed: how each starts small, what it keeps, how it ends.
 
 A command joins the suite with one entry of `JOBS`, or of `WRITERS` where it only writes
-at its end. `docs/generate.py` writes tables of docs/faults.md from this file.
+at its end. `docs/generate.py` writes tables of docs/reference/faults.md from this file.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from mi_nerfattack.scenario.scenario import load_scenario
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-GUIDE = Path(__file__).parents[2] / "docs" / "policy.md"
+GUIDE = Path(__file__).parents[2] / "docs/howto/policy.md"
 CHAPTER = (
     GUIDE.read_text("utf-8").partition("\n## openpilot\n")[2].partition("\n## ")[0]
 )

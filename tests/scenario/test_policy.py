@@ -29,7 +29,7 @@ from mi_nerfattack.scenario.scenario import load_scenario
 pytestmark = pytest.mark.usefixtures("variant")
 
 DOCS = Path(__file__).parents[2] / "docs"
-GUIDE = DOCS / "policy.md"
+GUIDE = DOCS / "howto/policy.md"
 SCENARIO = HEAD.partition("[policy]")[0]
 
 
@@ -45,7 +45,7 @@ def chapters(page=GUIDE):
             yield pytest.param(python, toml[0], id=title)
 
 
-EXAMPLES = [*chapters(), *chapters(DOCS / "your_policy.md")]
+EXAMPLES = [*chapters(), *chapters(DOCS / "howto/your_policy.md")]
 
 
 def server_of_the_guide():

@@ -26,7 +26,7 @@ from mi_nerfattack.io import files
 
 ROOT = Path(__file__).parents[3]
 SCENES, DOCS = ROOT / "scenes", ROOT / "docs"
-TABLE2, METHODS = DOCS / "table2", DOCS / "methods"
+TABLE2, METHODS = DOCS / "results/table2", DOCS / "results/methods"
 
 
 def test_text_around_the_figures_stays(tmp_path):
@@ -116,7 +116,7 @@ def test_the_committed_summary_is_that_of_the_committed_table(folder):
     assert digits(found) == digits(files.read_json(folder / SUMMARY))
 
 
-@pytest.mark.parametrize("folder", [TABLE2, METHODS, DOCS / "matrix"])
+@pytest.mark.parametrize("folder", [TABLE2, METHODS, DOCS / "results/matrix"])
 def test_the_committed_page_is_that_of_the_committed_table(folder, tmp_path):
     shutil.copy(folder / "README.md", tmp_path)
     words = ["report", str(folder), "-o", str(tmp_path / "README.md")]

@@ -44,7 +44,7 @@ def test_a_grid_of_a_scenario_alone_and_the_example_of_the_guide(
     (cell,) = load_cells(path)
     assert cell.id.startswith("line-ball-gradient-0-")
     assert cell.scenario.attack.method.iterations(1) == 3
-    guide = Path(__file__).parents[3] / "docs" / "sweep.md"
+    guide = Path(__file__).parents[3] / "docs/howto/sweep.md"
     example = guide.read_text("utf-8").split("```toml\n")[1].split("```")[0]
     path = tmp_path / "grid.toml"
     path.write_text(example)

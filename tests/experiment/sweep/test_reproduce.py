@@ -235,7 +235,7 @@ def test_a_row_without_its_cell_is_refused(swept, tmp_path):
 
 def test_a_row_of_the_first_form_is_read():
     """Its cell keeps its name, though the scenario's digest is made of other keys."""
-    replay = read_replay(Path(__file__).parents[3] / "docs" / "table2", ["0"])
+    replay = read_replay(Path(__file__).parents[3] / "docs/results/table2", ["0"])
     [cell] = replay.cells
     assert cell.id == replay.table["cell"][0] and not changed(cell)
     assert cell.scenario.attack.method.iterations(1) == 24
