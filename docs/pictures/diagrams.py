@@ -15,7 +15,7 @@ from matplotlib.patches import FancyBboxPatch
 from mi_nerfattack.experiment.sweep.table import read_table
 from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, NO_OBJECT, RANDOM
 
-TABLE = Path(__file__).parents[1] / "table2/results.csv"
+TABLE = Path(__file__).parents[1] / "results/table2/results.csv"
 LIMIT_M = 0.85  # beyond it a wheel is out of the lane: (3.5 m - 1.8 m) / 2
 BLACK, BLUE, ORANGE, GREY = "#222222", "#0072B2", "#D55E00", "#666666"
 # Text stays text, and a drawing that is made again is the same file.

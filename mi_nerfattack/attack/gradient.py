@@ -343,8 +343,8 @@ class GradientAttack(AbstractAttack):
         self.best_offsets = np.array(tensors["best_offsets"])
         self._best = {key: np.array(tensors[f"best.{key}"]) for key in self._best}
         for key, best in self._best.items():
-            change = np.abs(self._colourings[key].project(best) - best)
-            if not change.max(initial=0) < 1e-3:  # nor NaN
+            allowed = np.allclose(self._colourings[key].project(best), best, 0, 1e-3)
+            if not (allowed and np.isfinite(best).all()):
                 raise InputError(f"best.{key}: colours that the attack may not have")
         load_adam(self.optimiser, tensors)
         self.restore_best()

@@ -122,7 +122,7 @@ class PilotNet(nn.Module):
             if not isinstance(max_control, float):
                 raise ValueError(f"max_control {max_control!r}")
             network = cls(goals, max_control, metadata.get("unit", "rad/s"))
-        except (KeyError, ValueError) as error:
+        except (KeyError, ValueError, RecursionError) as error:
             raise InputError(f"{path}: unusable metadata: {error}") from error
         load_checked(network, tensors, str(path))
         return network.eval()

@@ -74,7 +74,7 @@ def test_wanted_labels_are_those_of_the_cells(tmp_path):
 @pytest.mark.parametrize("name", PAGES)
 def test_a_page_is_what_its_table_gives(name):
     study = PAGES[name]
-    made, picture = finding(study), f"../pictures/finding_{name}.png"
+    made, picture = finding(study), f"../../pictures/finding_{name}.png"
     assert made is not None
     text = page_text(study, made, state(study, compare=False), picture)
     page = (FOLDER / f"{name}.md").read_text("utf-8")

@@ -30,7 +30,7 @@ def test_every_script_and_its_scene_are_shown():
 def test_every_plugin_has_a_section_with_its_parts(name):
     sections = re.split(r"^## ", PAGES[DOCS / "reference/plugins.md"], flags=re.M)
     (section,) = (text for text in sections if f"(`{name}`)\n" in text)
-    assert f"](pictures/plugin_{name}.jpg)" in section
+    assert f"](../pictures/plugin_{name}.jpg)" in section
     assert "| Parameter | Type | Description | Flags |" in section
     assert f'type="{name}"' in section and f'"type": "{name}"' in section
 

@@ -39,6 +39,8 @@ SKIPPED = {
     **dict.fromkeys("examples howto/fields howto/place".split(), INPUT),
     **dict.fromkeys("howto/render howto/report howto/retrain".split(), INPUT),
     **dict.fromkeys("howto/transfer howto/view".split(), INPUT),
+    **dict.fromkeys(f"results/{x}/README" for x in ("matrix", "methods", "table2")), INPUT),
+    "results/findings/index": LONG,
     "car/index": "takes a run, a camera, a tracker or a car",
     "howto/environments": "takes CARLA's server, or more than a minute",
     "reference/commands": "writes into the home folder",

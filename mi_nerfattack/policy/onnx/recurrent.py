@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
+from torch.nn.functional import linear
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.onnx.call import Call, Operator
@@ -38,7 +39,7 @@ def _lstm_cell(
     hidden: torch.Tensor,
     cell: torch.Tensor,
 ) -> tuple[torch.Tensor, ...]:
-    gates = gates + hidden @ weight.T + bias
+    gates = gates + linear(hidden, weight, bias)
     into, out, forget, candidate = gates.chunk(4, dim=-1)
     cell = forget.sigmoid() * cell + into.sigmoid() * candidate.tanh()
     return out.sigmoid() * cell.tanh(), cell
@@ -48,7 +49,7 @@ def _gru_cell(
     gates: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor, hidden: torch.Tensor
 ) -> tuple[torch.Tensor, ...]:
     update, reset, candidate = gates.chunk(3, dim=-1)
-    update_h, reset_h, candidate_h = (hidden @ weight.T + bias).chunk(3, dim=-1)
+    update_h, reset_h, candidate_h = linear(hidden, weight, bias).chunk(3, dim=-1)
     update = (update + update_h).sigmoid()
     candidate = (candidate + (reset + reset_h).sigmoid() * candidate_h).tanh()
     return ((1 - update) * candidate + update * hidden,)
@@ -60,9 +61,9 @@ def _gru_cell_reset_first(
     first, last = weight.tensor_split([2 * hidden.shape[-1]])
     bias_first, bias_last = bias.tensor_split([2 * hidden.shape[-1]])
     update, reset, candidate = gates.chunk(3, dim=-1)
-    both = (torch.cat([update, reset], -1) + hidden @ first.T + bias_first).sigmoid()
+    both = (torch.cat([update, reset], -1) + linear(hidden, first, bias_first)).sigmoid()
     update, reset = both.chunk(2, dim=-1)
-    candidate = (candidate + (reset * hidden) @ last.T + bias_last).tanh()
+    candidate = (candidate + linear(reset * hidden, last, bias_last)).tanh()
     return ((1 - update) * candidate + update * hidden,)
 
 
@@ -84,7 +85,7 @@ def _layer(
         bias = call.get(3)
         flat = x.new_zeros(2 * gates * size) if bias is None else bias[i]
         before, within = flat.chunk(2)
-        projected = x @ call.need(1)[i].T + before
+        projected = linear(x, call.need(1)[i], before)
         state = tuple(
             x.new_zeros(x.shape[1], size) if start is None else start[i]
             for start in (call.get(5), call.get(6))[:states]
