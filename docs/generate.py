@@ -2,8 +2,8 @@
 
     python docs/generate.py
 
-docs/examples.md shows files of docs/examples/. docs/reference/faults.md shows the tables of the
-suite in tests/faults. docs/reference/plugins.md shows the class
+docs/examples.md shows files of docs/examples/. docs/reference/faults.md shows the
+tables of the suite in tests/faults. docs/reference/plugins.md shows the class
 docstrings of plugins/*.py, which are reStructuredText in the format of Mitsuba's plugin
 reference. No plugin is imported. tests/docs/test_generated.py compares the pages with
 the files.
@@ -106,7 +106,9 @@ def plugin_reference() -> str:
             title, *body = section.children
             heading = inline(title)
             anchor = re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-")
-            picture = f"![Picture of {source.stem}](../pictures/plugin_{source.stem}.jpg)"
+            picture = (
+                f"![Picture of {source.stem}](../pictures/plugin_{source.stem}.jpg)"
+            )
             contents.append(f"- [{heading}](#{anchor})")
             parts = [part for node in body for part in block(node)]
             sections += [f"## {heading}", picture, *parts]

@@ -111,7 +111,7 @@ def test_a_side_is_farther_if_wilsons_interval_lies_above_one_half():
 
 
 def test_equal_sides_are_seldom_farther_by_chance():
-    """By the binomial distribution, as docs/results/findings/index.md says: 4 % at most."""
+    """By the binomial distribution, as the page of findings says: 4 % at most."""
     for places in range(5, 41):
         majorities = [k for k in range(places + 1) if is_majority(k, places)]
         ways = sum(math.comb(places, k) for k in majorities)

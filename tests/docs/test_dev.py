@@ -86,7 +86,9 @@ def test_every_package_with_public_names_is_in_the_reference():
     assert documented == names | {"mi_nerfattack"}
 
 
-NAMED = re.findall(r"`(tests/[^`]*)`", (ROOT / "docs/reference/faults.md").read_text("utf-8"))
+NAMED = re.findall(
+    r"`(tests/[^`]*)`", (ROOT / "docs/reference/faults.md").read_text("utf-8")
+)
 TESTS = sorted({name for name in NAMED if "::" in name})
 
 

@@ -39,7 +39,7 @@ SKIPPED = {
     **dict.fromkeys("examples howto/fields howto/place".split(), INPUT),
     **dict.fromkeys("howto/render howto/report howto/retrain".split(), INPUT),
     **dict.fromkeys("howto/transfer howto/view".split(), INPUT),
-    **dict.fromkeys(f"results/{x}/README" for x in ("matrix", "methods", "table2")), INPUT),
+    **{f"results/{x}/README": INPUT for x in ("matrix", "methods", "table2")},
     "results/findings/index": LONG,
     "car/index": "takes a run, a camera, a tracker or a car",
     "howto/environments": "takes CARLA's server, or more than a minute",

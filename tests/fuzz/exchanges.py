@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 import socket
+import threading
 from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
@@ -50,8 +51,7 @@ def requests(folder: Path) -> Targets:
         ours, theirs = _connected()
         with closing(ours), closing(theirs):
             ours.settimeout(_SECONDS)
-            ours.sendall(raw)
-            ours.shutdown(socket.SHUT_WR)
+            _send(ours, raw)
             http_server._Handler(theirs, ("127.0.0.1", 1), server)
             theirs.close()
             answer = b""
@@ -94,8 +94,7 @@ def answers(folder: Path) -> Targets:
         client = PolicyClient("http://127.0.0.1:1", timeout_s=_SECONDS, retries=0)
         ours, theirs = _connected()
         with closing(ours), closing(theirs):
-            theirs.sendall(path.read_bytes())
-            theirs.shutdown(socket.SHUT_WR)
+            _send(theirs, path.read_bytes())
             client._http.sock = client._socket = ours
             # the connection is no new one: the client would connect again
             client._connect = _lost
@@ -103,6 +102,17 @@ def answers(folder: Path) -> Targets:
         assert controls.dtype == np.float64
 
     return [(folder / f"{name}.http", read) for name in heads]
+
+
+def _send(sock: socket.socket, raw: bytes) -> None:
+    """Send bytes, then the end, while the other side reads: a buffer may fill."""
+
+    def send() -> None:
+        with suppress(OSError):  # the other side ended the connection
+            sock.sendall(raw)
+            sock.shutdown(socket.SHUT_WR)
+
+    threading.Thread(target=send, daemon=True).start()
 
 
 def _connected() -> tuple[socket.socket, socket.socket]:

@@ -198,7 +198,7 @@ def test_function_of_the_user(write):
 
 
 def test_examples_of_the_manual(write, tmp_path):
-    """The scenario and the function in docs/howto/attack.md work as they are written."""
+    """The scenario and the function in docs/howto/attack.md work as written."""
     manual = (Path(__file__).parents[2] / "docs/howto/attack.md").read_text("utf-8")
     section = manual[manual.index("## The objective") :]
     [toml] = re.findall(r"```toml\n(.*?)```", section, re.S)[:1]

@@ -61,7 +61,9 @@ def _gru_cell_reset_first(
     first, last = weight.tensor_split([2 * hidden.shape[-1]])
     bias_first, bias_last = bias.tensor_split([2 * hidden.shape[-1]])
     update, reset, candidate = gates.chunk(3, dim=-1)
-    both = (torch.cat([update, reset], -1) + linear(hidden, first, bias_first)).sigmoid()
+    both = (
+        torch.cat([update, reset], -1) + linear(hidden, first, bias_first)
+    ).sigmoid()
     update, reset = both.chunk(2, dim=-1)
     candidate = (candidate + linear(reset * hidden, last, bias_last)).tanh()
     return ((1 - update) * candidate + update * hidden,)
