@@ -2,7 +2,8 @@
 
 A title follows the rules of docs/results/findings/index.md: one side is farther from
 the lane centre than another only if it is farther at so many places that Wilson's 95 %
-interval of their share lies above one half. A study with missing attacks claims nothing.
+interval of their share lies above one half. A study with missing attacks claims
+nothing.
 """
 
 from __future__ import annotations
