@@ -44,6 +44,7 @@ SKIPPED = {
     "car/index": "takes a run, a camera, a tracker or a car",
     "howto/environments": "takes CARLA's server, or more than a minute",
     "reference/commands": "writes into the home folder",
+    "start/first_attack": LONG,
     "start/install": "installs",
 }
 
