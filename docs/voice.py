@@ -200,7 +200,8 @@ def _machines(markdown: str) -> Iterator[Finding]:
 
 def pages() -> dict[str, Path]:
     """Find the pages of the repository, by their names in it."""
-    paths = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/**/*.md")]
+    alone = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "paper/paper.md")]
+    paths = [*alone, *ROOT.glob("docs/**/*.md")]
     return {path.relative_to(ROOT).as_posix(): path for path in sorted(paths)}
 
 

@@ -10,7 +10,6 @@ import sys
 import threading
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import pytest
 from support.reference.derivatives import later
@@ -134,11 +133,6 @@ def test_other_threads_may_call(run):
     thread.start()
     thread.join()
     assert codes == [0]
-
-
-def test_the_citation_is_of_this_version():
-    text = (Path(__file__).parents[1] / "CITATION.cff").read_text("utf-8")
-    assert f"version: {mi_nerfattack.__version__}" in text.splitlines()
 
 
 def test_completion_is_printed(run):

@@ -13,10 +13,10 @@ from markdown_it import MarkdownIt
 from markdown_it.token import Token
 
 ROOT = Path(__file__).parents[2]
-# Those of ROOT and scenes/ are not on the site: `make docs` does not check their links.
+# Those of ROOT, paper/ and scenes/ are not on the site: `make docs` does not check their links.
 PAGES = [
     path
-    for pattern in ("*.md", "docs/**/*.md", "scenes/**/*.md")
+    for pattern in ("*.md", "docs/**/*.md", "paper/*.md", "scenes/**/*.md")
     for path in sorted(ROOT.glob(pattern))
 ]
 NAMES = [path.relative_to(ROOT).as_posix() for path in PAGES]
