@@ -13,7 +13,7 @@ from markdown_it import MarkdownIt
 from markdown_it.token import Token
 
 ROOT = Path(__file__).parents[2]
-# Those of ROOT, paper/ and scenes/ are not on the site: `make docs` does not check their links.
+# Those of ROOT, paper/ and scenes/ are not on the site: no other check of their links.
 PAGES = [
     path
     for pattern in ("*.md", "docs/**/*.md", "paper/*.md", "scenes/**/*.md")

@@ -60,7 +60,7 @@ def test_both_at_once_go_on_from_their_tensors(single_thread):
     for name, value in whole.tensors().items():
         np.testing.assert_array_equal(resumed.tensors()[name], value, name)
     assert whole.best_offsets.any()
-    for wrong in (1.5, np.nan):
+    for wrong in (1.5, np.nan, np.inf, -np.inf):
         damaged = {key: value.copy() for key, value in half.tensors().items()}
         damaged["best.0"][0, 0] = wrong
         with pytest.raises(

@@ -254,6 +254,7 @@ test_what_is_refused = refusals(
     (changed(lambda t, m: t[BIAS].fill(np.nan)), "not finite"),
     (changed(lambda t, m: m.update(goals="2")), "head.0.weight"),
     (changed(lambda t, m: m.update(architecture="other")), "'other'"),
+    (changed(lambda t, m: m.update(max_control="[" * 100_000)), "recursion"),
     (lambda: PilotNet(goals=0), "goals"),
     (lambda: PilotNet(max_control=float("inf")), "max_control"),
     (lambda: PilotNet(unit="deg"), "unit"),

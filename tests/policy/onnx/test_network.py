@@ -148,6 +148,7 @@ ASPECT = HALF | {"keep_aspect_ratio_policy": "not_larger"}
 CUBIC = {"mode": "cubic", "name": "up"}
 TWICE = np.float32([1, 1, 2, 2])
 POOL = {"kernel_shape": [1, 1], "strides": [3, 3], "ceil_mode": 1}
+FLAT = np.zeros((12, 5), "f4")  # recurrent weights without a direction
 INFINITY = np.float32(np.inf)
 
 
@@ -164,6 +165,7 @@ INFINITY = np.float32(np.inf)
         ),
         ("OneHot", [INFINITY, np.float32([0, 1])], 17, {}, "infinity"),
         ("Reshape", [INFINITY[None]], 17, {}, "infinity"),
+        ("LSTM", [FLAT, FLAT], 17, {"hidden_size": 3}, "LSTM.*matrix"),
         ("MaxPool", [], 17, POOL, r"ceil_mode with strides \[3, 3\]"),
     ],
 )
