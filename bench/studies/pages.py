@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import textwrap
 from collections.abc import Sequence
 from os.path import relpath
 from pathlib import Path
+
+from PIL import Image
 
 from bench.studies.findings import Finding, finding
 from bench.studies.plan import ROOT, UNKNOWN, State, Study, read_plan, state
@@ -39,12 +42,21 @@ def write_pages(
             chart = files.make_folder(pictures) / f"finding_{study.finding}.png"
             with blank(_SIZE_IN, _DPI) as figure:
                 made.draw(figure)
-                files.write_bytes(chart, png(figure))
+                files.write_bytes(chart, _smaller(png(figure)))
             page = files.make_folder(folder) / f"{study.finding}.md"
             one = state(study, compare=False)
             files.write_text(page, page_text(study, made, one, relpath(chart, folder)))
             written.append(page)
     return written
+
+
+def _smaller(image: bytes) -> bytes:
+    """Return a PNG file with 64 colours, which charts need at most."""
+    buffer = io.BytesIO()
+    with Image.open(io.BytesIO(image)) as chart:
+        few = chart.convert("RGB").quantize(64, dither=Image.Dither.NONE)
+    few.save(buffer, "PNG", optimize=True)
+    return buffer.getvalue()
 
 
 def page_text(study: Study, made: Finding, one: State, picture: str) -> str:
