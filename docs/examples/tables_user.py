@@ -5,9 +5,8 @@ from pathlib import Path
 import mi_nerfattack as nf
 from mi_nerfattack.experiment.sweep.sweep import FinishedSweep
 
-folder = (
-    Path(__file__).parents[1] / "results/table2"
-)  # of a sweep, or a copy of its tables
+# of a sweep, or a copy of its tables
+folder = Path(__file__).parents[1] / "results/table2"
 drives = FinishedSweep(folder).drives  # a DataFrame with one row per drive
 drives = drives[drives["environment"] == "mitsuba"]
 
