@@ -64,7 +64,12 @@ def test_the_picture_shows_the_folders_in_their_order():
 
 def test_every_page_is_in_the_contents():
     docs = ROOT / "docs"
-    names = ("index.md", "tutorials/index.md", "results/findings/index.md")
+    names = (
+        "index.md",
+        "notebooks/index.md",
+        "tutorials/index.md",
+        "results/findings/index.md",
+    )
     contents = [docs / name for name in names]
     listed = {
         (page.parent / name).resolve()
