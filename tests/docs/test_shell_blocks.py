@@ -11,6 +11,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from textwrap import dedent
 
 import pytest
 import tyro
@@ -26,6 +27,8 @@ RUN = {
     "mi-nerfattack render frame scenes/intersection/field.xml -o by_depth.exr \\",
     "mi-nerfattack render frame scenes/intersection/field.xml -o lit.png --sensor 1 "
     "--set relit=true",
+    "mi-nerfattack asset flat billboard -o board.safetensors --width-m 2 "
+    "--height-m 1.5",
 }
 # Why the other blocks of a page are not run.
 INPUT = "takes files of the user's, or a folder that minutes to hours of work made"
@@ -35,7 +38,8 @@ SKIPPED = {
     **dict.fromkeys("README index howto/certify howto/policy".split(), LONG),
     **dict.fromkeys("howto/training howto/your_policy".split(), LONG),
     **dict.fromkeys("reference/room results/bench results/refine".split(), LONG),
-    **dict.fromkeys("howto/attack howto/sweep".split(), USAGE),
+    **dict.fromkeys("howto/sweep".split(), USAGE),
+    **dict.fromkeys("howto/attack howto/flat_objects howto/search".split(), INPUT),
     **dict.fromkeys("examples howto/fields howto/place".split(), INPUT),
     **dict.fromkeys("howto/render howto/report howto/retrain".split(), INPUT),
     **dict.fromkeys("howto/transfer howto/view".split(), INPUT),
@@ -51,11 +55,12 @@ SKIPPED = {
 
 def blocks(page: Path, languages: tuple[str, ...] = ("",)) -> list[str]:
     """Find the blocks of a page that call us."""
-    fenced = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text("utf-8"), re.M | re.S)
+    fence = re.compile(r"^( *)```(\w*)\n(.*?)^\1```$", re.M | re.S)  # in lists, too
     ours = r"^(\S*/)?(mi-nerfattack|python -m|make|pip) "
+    fenced = fence.findall(page.read_text("utf-8"))
     return [
         text
-        for language, text in fenced
+        for language, text in ((word, dedent(text)) for _, word, text in fenced)
         if language in languages and re.search(ours, text, re.M)
     ]
 
