@@ -27,8 +27,7 @@ RUN = {
     "mi-nerfattack render frame scenes/intersection/field.xml -o by_depth.exr \\",
     "mi-nerfattack render frame scenes/intersection/field.xml -o lit.png --sensor 1 "
     "--set relit=true",
-    "mi-nerfattack asset flat billboard -o board.safetensors --width-m 2 "
-    "--height-m 1.5",
+    "mi-nerfattack asset flat patch -o patch.safetensors --width-m 1.8 --height-m 4",
 }
 # Why the other blocks of a page are not run.
 INPUT = "takes files of the user's, or a folder that minutes to hours of work made"
