@@ -12,7 +12,7 @@ from support.files.runs import HEAD
 
 from docs import schema
 from mi_nerfattack.io.strict import parse_toml
-from mi_nerfattack.scenario import attack, objective, objects, scenario
+from mi_nerfattack.scenario import attack, objective, objects, scenario, vehicle
 from mi_nerfattack.scenario.scenario import Scenario
 from mi_nerfattack.scenario.section import NamedCameraSection, Section
 
@@ -49,6 +49,7 @@ LISTED: dict[str, list[type[Section]]] = {
     "Objects": [objects.FieldObjectSection],
     "The camera": [NamedCameraSection],
     "The drive": [scenario.DriveSection],
+    "The vehicle": [vehicle.DubinsSection],
     "The attack": [attack.AttackSection],
     "The search method": [
         attack.GradientMethod,
@@ -63,8 +64,8 @@ LISTED: dict[str, list[type[Section]]] = {
     "Sun and sky": [objective.SunSection],
     "The baseline": [scenario.BaselineSection],
 }
-#: Keys that are tables, or are listed as kinds.
-TABLES = {"method", "freedom", "adjoint", "vary", "sun"}
+#: Keys that are tables with a section or page of their own, or belong to one model.
+ELSEWHERE = {"method", "freedom", "adjoint", "vary", "sun", "max_heading_rate"}
 
 
 def allows(rule, value, defs) -> bool:
@@ -159,7 +160,7 @@ def with_defaults(models: list[type[Section]]) -> set[tuple[str, str]]:
     found: set[tuple[str, str]] = set()
     for model in models:
         for key, default in model.defaults().items():
-            if key not in TABLES:
+            if key not in ELSEWHERE:
                 none = default in (None, (), PydanticUndefined)
                 found.add((key, "" if none else json.dumps(default)))
     return found
