@@ -54,13 +54,13 @@ SKIPPED = {
 
 def blocks(page: Path, languages: tuple[str, ...] = ("",)) -> list[str]:
     """Find the blocks of a page that call us."""
-    fence = re.compile(r"^( *)```(\w*)\n(.*?)^\1```$", re.M | re.S)  # in lists, too
+    fence = r"^( *)```(\w*)\n(.*?)^\1```$"  # indented in a list
+    fenced = re.findall(fence, page.read_text("utf-8"), re.M | re.S)
     ours = r"^(\S*/)?(mi-nerfattack|python -m|make|pip) "
-    fenced = fence.findall(page.read_text("utf-8"))
     return [
-        text
-        for language, text in ((word, dedent(text)) for _, word, text in fenced)
-        if language in languages and re.search(ours, text, re.M)
+        dedent(text)
+        for _, language, text in fenced
+        if language in languages and re.search(ours, dedent(text), re.M)
     ]
 
 
