@@ -11,6 +11,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from textwrap import dedent
 
 import pytest
 import tyro
@@ -26,6 +27,7 @@ RUN = {
     "mi-nerfattack render frame scenes/intersection/field.xml -o by_depth.exr \\",
     "mi-nerfattack render frame scenes/intersection/field.xml -o lit.png --sensor 1 "
     "--set relit=true",
+    "mi-nerfattack asset flat patch -o patch.safetensors --width-m 1.8 --height-m 4",
 }
 # Why the other blocks of a page are not run.
 INPUT = "takes files of the user's, or a folder that minutes to hours of work made"
@@ -35,7 +37,8 @@ SKIPPED = {
     **dict.fromkeys("README index howto/certify howto/policy".split(), LONG),
     **dict.fromkeys("howto/training howto/your_policy".split(), LONG),
     **dict.fromkeys("reference/room results/bench results/refine".split(), LONG),
-    **dict.fromkeys("howto/attack howto/sweep".split(), USAGE),
+    **dict.fromkeys("howto/sweep".split(), USAGE),
+    **dict.fromkeys("howto/attack howto/flat_objects howto/search".split(), INPUT),
     **dict.fromkeys("examples howto/fields howto/place".split(), INPUT),
     **dict.fromkeys("howto/render howto/report howto/retrain".split(), INPUT),
     **dict.fromkeys("howto/transfer howto/view".split(), INPUT),
@@ -51,12 +54,13 @@ SKIPPED = {
 
 def blocks(page: Path, languages: tuple[str, ...] = ("",)) -> list[str]:
     """Find the blocks of a page that call us."""
-    fenced = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text("utf-8"), re.M | re.S)
+    fence = r"^( *)```(\w*)\n(.*?)^\1```$"  # indented in a list
+    fenced = re.findall(fence, page.read_text("utf-8"), re.M | re.S)
     ours = r"^(\S*/)?(mi-nerfattack|python -m|make|pip) "
     return [
-        text
-        for language, text in fenced
-        if language in languages and re.search(ours, text, re.M)
+        dedent(text)
+        for _, language, text in fenced
+        if language in languages and re.search(ours, dedent(text), re.M)
     ]
 
 
