@@ -16,7 +16,10 @@ BENCH = (ROOT / "docs/results/bench.md").read_text("utf-8")
 # Figures that only their page has, by page; a count may only fall.
 PENDING = {
     "README.md": 3,
-    "docs/howto/attack.md": 6,
+    "docs/howto/attack.md": 2,
+    "docs/howto/resume.md": 1,
+    "docs/reference/checks.md": 1,
+    "docs/reference/run_folder.md": 2,
     "docs/results/bench.md": 15,
     "docs/howto/environments.md": 2,
     "docs/howto/fields.md": 5,

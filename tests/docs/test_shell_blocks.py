@@ -36,6 +36,8 @@ SKIPPED = {
     **dict.fromkeys("howto/training howto/your_policy".split(), LONG),
     **dict.fromkeys("reference/room results/bench results/refine".split(), LONG),
     **dict.fromkeys("howto/attack howto/sweep".split(), USAGE),
+    **dict.fromkeys("howto/check howto/deployment howto/resume".split(), INPUT),
+    "howto/vehicle": INPUT,
     **dict.fromkeys("examples howto/fields howto/place".split(), INPUT),
     **dict.fromkeys("howto/render howto/report howto/retrain".split(), INPUT),
     **dict.fromkeys("howto/transfer howto/view".split(), INPUT),

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 FOUND = {name: findings_in(name, path) for name, path in pages().items()}
 # Pages that do not pass yet, with their number of findings; it may only fall.
 PENDING = {
-    "docs/howto/attack.md": 58,
+    "docs/howto/attack.md": 22,
     "docs/howto/environments.md": 24,
     "docs/howto/fields.md": 46,
     "docs/reference/formats.md": 2,
