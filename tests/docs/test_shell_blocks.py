@@ -39,6 +39,8 @@ SKIPPED = {
     **dict.fromkeys("reference/room results/bench results/refine".split(), LONG),
     **dict.fromkeys("howto/sweep".split(), USAGE),
     **dict.fromkeys("howto/attack howto/flat_objects howto/search".split(), INPUT),
+    **dict.fromkeys("howto/check howto/deployment".split(), INPUT),
+    **dict.fromkeys("howto/resume howto/vehicle".split(), INPUT),
     **dict.fromkeys("examples howto/fields howto/place".split(), INPUT),
     **dict.fromkeys("howto/render howto/report howto/retrain".split(), INPUT),
     **dict.fromkeys("howto/transfer howto/view".split(), INPUT),
