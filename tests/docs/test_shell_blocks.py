@@ -11,6 +11,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from textwrap import dedent
 
 import pytest
 import tyro
@@ -54,12 +55,13 @@ SKIPPED = {
 
 def blocks(page: Path, languages: tuple[str, ...] = ("",)) -> list[str]:
     """Find the blocks of a page that call us."""
-    fenced = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text("utf-8"), re.M | re.S)
+    fence = r"^( *)```(\w*)\n(.*?)^\1```$"  # indented in a list
+    fenced = re.findall(fence, page.read_text("utf-8"), re.M | re.S)
     ours = r"^(\S*/)?(mi-nerfattack|python -m|make|pip) "
     return [
-        text
-        for language, text in fenced
-        if language in languages and re.search(ours, text, re.M)
+        dedent(text)
+        for _, language, text in fenced
+        if language in languages and re.search(ours, dedent(text), re.M)
     ]
 
 
