@@ -71,7 +71,8 @@ _MACHINES = re.compile(
     r"|[AHV][12]00|RTX \w+|GTX \w+|Tesla [A-Z]\d+)\b"
 )
 _RESULTS = tuple(
-    f"docs/results/{x}" for x in ("bench.md", "table2/", "methods/", "matrix/")
+    f"docs/results/{x}"
+    for x in ("bench.md", "fields.md", "table2/", "methods/", "matrix/")
 )
 
 _SENTENCE_END = re.compile(r"(?<!\.\.)[.!?][)\]\"'”’*]*\s+")

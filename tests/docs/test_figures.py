@@ -16,10 +16,12 @@ BENCH = (ROOT / "docs/results/bench.md").read_text("utf-8")
 # Figures that only their page has, by page; a count may only fall.
 PENDING = {
     "README.md": 1,
-    "docs/howto/attack.md": 4,
+    "docs/howto/resume.md": 1,
+    "docs/reference/checks.md": 1,
+    "docs/reference/run_folder.md": 2,
     "docs/results/bench.md": 17,
     "docs/howto/environments.md": 2,
-    "docs/howto/fields.md": 5,
+    "docs/results/fields.md": 5,
     "docs/howto/loop.md": 1,
     "docs/howto/retrain.md": 4,
     "docs/car/index.md": 3,
