@@ -10,6 +10,7 @@ import re
 import shlex
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,7 @@ from mi_nerfattack.commands import COMMANDS, each
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 RUN = {
+    "mi-nerfattack check scenes/demo.toml --no-drives -o check.png",
     "mi-nerfattack render frame scenes/intersection/field.xml -o hydrant.exr",
     "mi-nerfattack render frame scenes/intersection/field.xml -o hydrant.png \\",
     "mi-nerfattack render frame scenes/intersection/field.xml -o by_depth.exr \\",
@@ -39,10 +41,13 @@ SKIPPED = {
     **dict.fromkeys("examples howto/fields howto/place".split(), INPUT),
     **dict.fromkeys("howto/render howto/report howto/retrain".split(), INPUT),
     **dict.fromkeys("howto/transfer howto/view".split(), INPUT),
+    **dict.fromkeys("howto/conditions howto/openscenario".split(), INPUT),
+    **dict.fromkeys("howto/environments howto/mujoco".split(), LONG),
+    **dict.fromkeys("reference/places reference/routes".split(), LONG),
     **{f"results/{x}/README": INPUT for x in ("matrix", "methods", "table2")},
     "results/findings/index": LONG,
     "car/index": "takes a run, a camera, a tracker or a car",
-    "howto/environments": "takes CARLA's server, or more than a minute",
+    "howto/carla": "takes CARLA's server",
     "reference/commands": "writes into the home folder",
     "start/first_attack": LONG,
     "start/install": "installs",
@@ -51,13 +56,13 @@ SKIPPED = {
 
 def blocks(page: Path, languages: tuple[str, ...] = ("",)) -> list[str]:
     """Find the blocks of a page that call us."""
-    fenced = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text("utf-8"), re.M | re.S)
+    text = page.read_text("utf-8")
+    fenced = re.findall(r"^( *)```(\w*)\n(.*?)^\1```$", text, re.M | re.S)
     ours = r"^(\S*/)?(mi-nerfattack|python -m|make|pip) "
-    return [
-        text
-        for language, text in fenced
-        if language in languages and re.search(ours, text, re.M)
+    found = [
+        textwrap.dedent(text) for _, language, text in fenced if language in languages
     ]
+    return [text for text in found if re.search(ours, text, re.M)]
 
 
 def name(page: Path) -> str:
