@@ -22,6 +22,7 @@ from mi_nerfattack.commands import COMMANDS, each
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 RUN = {
+    "mi-nerfattack check scenes/demo.toml --no-drives -o check.png",
     "mi-nerfattack render frame scenes/intersection/field.xml -o hydrant.exr",
     "mi-nerfattack render frame scenes/intersection/field.xml -o hydrant.png \\",
     "mi-nerfattack render frame scenes/intersection/field.xml -o by_depth.exr \\",
@@ -47,10 +48,13 @@ SKIPPED = {
     "results/fields": INPUT,
     **dict.fromkeys("howto/render howto/report howto/retrain".split(), INPUT),
     **dict.fromkeys("howto/transfer howto/view".split(), INPUT),
+    **dict.fromkeys("howto/conditions howto/openscenario".split(), INPUT),
+    **dict.fromkeys("howto/environments howto/mujoco".split(), LONG),
+    **dict.fromkeys("reference/places reference/routes".split(), LONG),
     **{f"results/{x}/README": INPUT for x in ("matrix", "methods", "table2")},
     "results/findings/index": LONG,
     "car/index": "takes a run, a camera, a tracker or a car",
-    "howto/environments": "takes CARLA's server, or more than a minute",
+    "howto/carla": "takes CARLA's server",
     "reference/commands": "writes into the home folder",
     "start/first_attack": LONG,
     "start/install": "installs",
