@@ -72,7 +72,7 @@ _MACHINES = re.compile(
 )
 _RESULTS = tuple(
     f"docs/results/{x}"
-    for x in ("bench.md", "fields.md", "table2/", "methods/", "matrix/")
+    for x in ("bench.md", "fields.md", "training.md", "table2/", "methods/", "matrix/")
 )
 
 _SENTENCE_END = re.compile(r"(?<!\.\.)[.!?][)\]\"'”’*]*\s+")

@@ -35,10 +35,10 @@ INPUT = "takes files of the user's, or a folder that minutes to hours of work ma
 LONG = "takes more than a minute"
 USAGE = "shows what may be given, in words that stand for it"
 SKIPPED = {
-    **dict.fromkeys("README index howto/certify howto/policy".split(), LONG),
-    **dict.fromkeys("howto/training howto/your_policy".split(), LONG),
+    **dict.fromkeys("README index howto/certify howto/evaluate".split(), LONG),
+    **dict.fromkeys("howto/frames howto/training howto/your_policy".split(), LONG),
     **dict.fromkeys("reference/room results/bench results/refine".split(), LONG),
-    **dict.fromkeys("howto/sweep".split(), USAGE),
+    **dict.fromkeys("howto/reproduce howto/sweep howto/sweep_cluster".split(), USAGE),
     **dict.fromkeys("howto/attack howto/flat_objects howto/search".split(), INPUT),
     **dict.fromkeys("howto/check howto/deployment".split(), INPUT),
     **dict.fromkeys("howto/resume howto/vehicle".split(), INPUT),
@@ -47,7 +47,8 @@ SKIPPED = {
     **dict.fromkeys("howto/photographs howto/poses howto/splats".split(), INPUT),
     "results/fields": INPUT,
     **dict.fromkeys("howto/render howto/report howto/retrain".split(), INPUT),
-    **dict.fromkeys("howto/transfer howto/view".split(), INPUT),
+    **dict.fromkeys("howto/transfer howto/view howto/policy".split(), INPUT),
+    **dict.fromkeys("howto/policy_steering howto/policy_url".split(), INPUT),
     **dict.fromkeys("howto/conditions howto/openscenario".split(), INPUT),
     **dict.fromkeys("howto/environments howto/mujoco".split(), LONG),
     **dict.fromkeys("reference/places reference/routes".split(), LONG),

@@ -133,7 +133,7 @@ def read_attacks(
 def summarise(
     table: pd.DataFrame, attacks: Sequence[Mapping[str, Any]] = ()
 ) -> dict[str, Any]:
-    """Return what ``summary.json`` holds; docs/howto/sweep.md says what it means.
+    """Return what ``summary.json`` holds; docs/reference/sweep.md says what it means.
 
     Args:
         table: of the sweep.
