@@ -25,7 +25,7 @@ PENDING = {
     "docs/results/fields.md": 5,
     "docs/howto/loop.md": 1,
     "docs/howto/retrain.md": 4,
-    "docs/car/index.md": 3,
+    "docs/results/car.md": 3,
     "docs/reference/room.md": 1,
     "docs/results/training.md": 4,
     "docs/howto/transfer.md": 1,
