@@ -49,6 +49,7 @@ SKIPPED = {
     "results/fields": INPUT,
     **dict.fromkeys("howto/render howto/report howto/retrain".split(), INPUT),
     **dict.fromkeys("howto/transfer howto/view howto/policy".split(), INPUT),
+    "howto/retrain_code": INPUT,
     **dict.fromkeys("howto/policy_steering howto/policy_url".split(), INPUT),
     **dict.fromkeys("howto/conditions howto/openscenario".split(), INPUT),
     **dict.fromkeys("howto/environments howto/mujoco".split(), LONG),
