@@ -59,7 +59,13 @@ highlight_language = "none"
 
 
 # Pages whose lists of links are the table of contents.
-CONTENTS = ("index", "notebooks/index", "tutorials/index", "results/findings/index")
+CONTENTS = (
+    "index",
+    "car/index",
+    "notebooks/index",
+    "tutorials/index",
+    "results/findings/index",
+)
 # The site shows these files as pages; in the repository a page links to each.
 CARDS = {
     "results/pilotnet": "scenes/policy/pilotnet.md",

@@ -72,7 +72,8 @@ _MACHINES = re.compile(
 )
 _RESULTS = tuple(
     f"docs/results/{x}"
-    for x in ("bench.md", "fields.md", "training.md", "table2/", "methods/", "matrix/")
+    for x in "bench.md car.md fields.md retrain.md training.md".split()
+    + "table2/ methods/ matrix/".split()
 )
 
 _SENTENCE_END = re.compile(r"(?<!\.\.)[.!?][)\]\"'”’*]*\s+")

@@ -66,6 +66,7 @@ def test_every_page_is_in_the_contents():
     docs = ROOT / "docs"
     names = (
         "index.md",
+        "car/index.md",
         "notebooks/index.md",
         "tutorials/index.md",
         "results/findings/index.md",

@@ -33,6 +33,7 @@ RUN = {
 # Why the other blocks of a page are not run.
 INPUT = "takes files of the user's, or a folder that minutes to hours of work made"
 LONG = "takes more than a minute"
+CAR = "takes a run, a camera, a tracker or a car"
 USAGE = "shows what may be given, in words that stand for it"
 SKIPPED = {
     **dict.fromkeys("README index howto/certify howto/evaluate".split(), LONG),
@@ -48,13 +49,16 @@ SKIPPED = {
     "results/fields": INPUT,
     **dict.fromkeys("howto/render howto/report howto/retrain".split(), INPUT),
     **dict.fromkeys("howto/transfer howto/view howto/policy".split(), INPUT),
+    "howto/retrain_code": INPUT,
     **dict.fromkeys("howto/policy_steering howto/policy_url".split(), INPUT),
     **dict.fromkeys("howto/conditions howto/openscenario".split(), INPUT),
     **dict.fromkeys("howto/environments howto/mujoco".split(), LONG),
     **dict.fromkeys("reference/places reference/routes".split(), LONG),
     **{f"results/{x}/README": INPUT for x in ("matrix", "methods", "table2")},
     "results/findings/index": LONG,
-    "car/index": "takes a run, a camera, a tracker or a car",
+    **{f"car/{x}": CAR for x in "compare drive monitor motor overlay".split()},
+    **{f"car/{x}": CAR for x in "print remote setup".split()},
+    **dict.fromkeys("results/car results/retrain".split(), LONG),
     "howto/carla": "takes CARLA's server",
     "reference/commands": "writes into the home folder",
     "start/first_attack": LONG,
