@@ -210,6 +210,12 @@ def pages() -> dict[str, Path]:
     return {path.relative_to(ROOT).as_posix(): path for path in sorted(paths)}
 
 
+def prose_words(markdown: str) -> int:
+    """Count the words of a page without its code and tables."""
+    tokens = MarkdownIt().enable("table").parse(markdown)
+    return sum(len(x.text.split()) for x in passages(tokens) if not x.in_table)
+
+
 def modules() -> dict[str, Path]:
     """Find the Python files of package and plugins, by their names."""
     paths = [*ROOT.glob("mi_nerfattack/**/*.py"), *ROOT.glob("plugins/*.py")]

@@ -9,7 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from docs.voice import docstrings, findings, findings_in, modules, pages, sentences
+from docs.voice import (
+    docstrings,
+    findings,
+    findings_in,
+    modules,
+    pages,
+    prose_words,
+    sentences,
+)
 
 ROOT = Path(__file__).parents[2]
 FOUND = {name: findings_in(name, path) for name, path in pages().items()}
@@ -90,6 +98,20 @@ def test_page_keeps_the_voice(page):
     assert len(found) <= allowed, f"{len(found)} findings, {allowed} allowed{listed}"
     lower = f"lower the count to {len(found)}" if found else "take the page out"
     assert len(found) == allowed, f"PENDING, {page}: {lower}"
+
+
+# How-to pages are short; a page of reference may be as long as its tables need.
+LONGEST = {"docs/howto/": 600, "docs/reference/": None, "paper/": None, "": 1500}
+
+
+def longest(page: str) -> int | None:
+    return next(size for folder, size in LONGEST.items() if page.startswith(folder))
+
+
+@pytest.mark.parametrize("page", [p for p in FOUND if longest(p)])
+def test_page_is_short(page):
+    words = prose_words((ROOT / page).read_text("utf-8"))
+    assert words <= longest(page), f"{words} words; split the page"
 
 
 def test_docstrings_keep_the_voice():
