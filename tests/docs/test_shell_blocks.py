@@ -44,6 +44,7 @@ SKIPPED = {
     **dict.fromkeys("results/reach results/studies".split(), LONG),
     **dict.fromkeys("results/photographs results/pages".split(), INPUT),
     "results/gpu": "takes a GPU",
+    "results/certificates": LONG,
     **dict.fromkeys("howto/attack howto/flat_objects howto/search".split(), INPUT),
     **dict.fromkeys("howto/check howto/deployment".split(), INPUT),
     **dict.fromkeys("howto/resume howto/vehicle".split(), INPUT),
