@@ -240,7 +240,7 @@ class FieldIntegrator(FilmIntegrator):
         gains: Sequence[Gain] = (),
         **kwargs: Any,
     ) -> tuple[Any, mi.Bool, list[mi.Float], Any]:
-        """Integrate one ray a lane; see Mitsuba's ``RBIntegrator.sample``.
+        """Integrate one ray per lane; see Mitsuba's ``RBIntegrator.sample``.
 
         A film gives cotangents of :meth:`splats` as ``δsplats``, and finds tangents in
         the place of the state. ``width``: rays in a row of an image, if nothing is

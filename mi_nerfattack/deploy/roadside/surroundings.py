@@ -104,8 +104,8 @@ class Surroundings:
 
         Args:
             route: of the lane.
-            begin: arc length, metres.
-            end: likewise.
+            begin: arc length at the start of the drive, metres.
+            end: arc length at the end of the drive, metres.
         """
         step = route.speed_ms * self.period
         arc = begin + step * np.arange(int((end - begin) / step + 1e-6) + 1)

@@ -145,7 +145,7 @@ class LateControls(AbstractAround):
         return self.inside.step(self._exchange(control))
 
     def advance(self, control: Controls) -> None:
-        """Likewise, and look at nothing."""
+        """Take a control and hold the one whose turn it is, without a new frame."""
         self.inside.advance(self._exchange(control))
 
     def _exchange(self, control: Controls) -> Controls:
