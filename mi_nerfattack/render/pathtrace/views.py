@@ -1,9 +1,9 @@
 """Render posed views of Mitsuba scenes: colour, opacity and depth.
 
-One sensor is kept and moved from view to view. Compared with Mitsuba's `batch` sensor,
-whose scene must be built (and whose kernels compiled) again for other poses, it
-compiles nothing after the first view, and no reconstruction filter crosses from one
-view into the next.
+The renderer keeps one sensor and moves it from view to view. It compiles nothing after
+the first view, and no reconstruction filter crosses from one view into the next. A
+scene with Mitsuba's `batch` sensor must be built again for other poses, and its kernels
+must be compiled again.
 """
 
 from __future__ import annotations
