@@ -136,7 +136,7 @@ class FieldIntegrator(FilmIntegrator):
     So is all that a nested ``prb``, ``prbvolpath`` or other differentiable integrator
     of Mitsuba's shows: BSDFs, bitmaps and lights, and fields that an emitter shares.
     In backward mode with respect to ``to_world`` of fields, and to the sensor where
-    fields are alone in the scene. AOVs are differentiated, too, but for the shares of
+    fields are alone in the scene. AOVs are differentiated, too, except the shares of
     single fields in ``interleaved``. What has no derivative raises an error: a nested
     integrator without that interface (``path``), moving surfaces, which occlude
     fields, and all but ``colour`` where a field is relit, whose light is constant.

@@ -319,7 +319,7 @@ class GridField(AbstractField):
     def density_bound(self) -> float:
         """Return the largest density in occupied cells before the window's factor.
 
-        Exact but for rounding. Kept until the density or the occupancy changes, since
+        Exact except for rounding. Kept until density or occupancy changes, because
         media ask for it after every change of a parameter.
         """
         if self._bound is None:

@@ -30,7 +30,7 @@ Error bounds, for a ray that runs l metres through the box and leaves it at t_fa
   a colour's slope. Opacity is off by at most ``h^2 V / 8``. With
   ``e = h^2 (V / 8 + S_1 / 4)``, a colour is off by at most
   ``e (L_0 + l L_1) + h^2 S_0 (L_1 (1 + S_0 h) / 12 + W / 4)``.
-- Opacity and colour of homogeneous media are exact but for rounding.
+- Opacity and colour of homogeneous media are exact except for rounding.
 """
 
 from __future__ import annotations

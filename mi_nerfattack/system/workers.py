@@ -168,8 +168,8 @@ class InThisProcess(AbstractWorkers):
 class Processes(AbstractWorkers):
     """Several processes with one thread each for rendering and one for torch.
 
-    A process takes the next piece when it is done with one; a new one takes the place
-    of one that died or failed. They end with this process, however it ends.
+    A process takes the next piece when it has finished one. A new process replaces a
+    process that died or failed. All of them end with this process, however it ends.
 
     Args:
         count: 1 to `MOST`.

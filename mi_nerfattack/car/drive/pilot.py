@@ -67,7 +67,7 @@ class LocalPilot(AbstractPilot):
             self._begins = True
 
     def close(self) -> None:
-        """End the thread, but for a policy that never comes back."""
+        """End the thread, unless its policy never returns."""
         with self._changed:
             self._closed = True
             self._changed.notify()

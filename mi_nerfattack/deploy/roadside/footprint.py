@@ -75,7 +75,7 @@ class Stands:
     """Boxes of one shape that stand upright, n of them.
 
     Attributes:
-        shape: theirs.
+        shape: the shape of all boxes.
         centre: (n, 2) of the boxes seen from above, metres in the world.
         ground: (n,), height of the ground, metres.
         yaw: (n,), radians.

@@ -22,10 +22,10 @@ _STREAM = 5  # of a drive's seed
 
 
 class AbstractAround(AbstractEnvironment):
-    """An environment around another one, which it is but for what it changes.
+    """An environment around another one, equal to it except for one change.
 
     Args:
-        inside: the other one; is reset, driven and closed.
+        inside: the other environment, which this one resets, drives and closes.
     """
 
     def __init__(self, inside: AbstractEnvironment) -> None:

@@ -26,7 +26,7 @@ class PackedNGP:
     registers. Dr.Jit's products with matrices in memory keep the sums in memory, and
     the march takes 1.4 times as long. A kernel is good for one set of weights;
     compiling it takes 1 s for 3,300 weights and 4 s for 11,000. Values are those of
-    :meth:`NGPField.eval` but for rounding.
+    :meth:`NGPField.eval` except for rounding.
 
     Args:
         field: the field, on the LLVM backend; see :meth:`suits`.

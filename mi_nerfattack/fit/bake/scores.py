@@ -40,7 +40,7 @@ def score_bake(
 
     Args:
         scene: the field at its pose in the routes' frame.
-        baked: the bricks at theirs.
+        baked: the bricks at their pose in the same frame.
         routes: at least one.
         camera: intrinsics.
         mount: of the camera on the vehicle; None for the default mount.

@@ -20,7 +20,8 @@ class HttpPolicy(AbstractBlackBox):
         url: http or https.
         timeout_s: longest wait for a whole answer.
         retries: how often a failed request is repeated.
-        preprocess: as for `AbstractBlackBox`; `action`, too.
+        preprocess: as for `AbstractBlackBox`.
+        action: as for `AbstractBlackBox`.
         inputs: the server gets the numbers that `inputs` names, and the frame
             unchanged, with the images of several cameras side by side.
         token: that the server asks for.

@@ -61,9 +61,9 @@ def frame_metadata(
             left out.
 
     Returns:
-        by name, JSON but for what is text itself: ``camera`` with its ``to_world``,
-        ``pose_convention``, ``seed``, ``spp``, ``variant``, ``versions``, ``digests``
-        and `more`.
+        by name, as JSON, or unchanged where a value is text: ``camera`` with its
+        ``to_world``, ``pose_convention``, ``seed``, ``spp``, ``variant``, ``versions``,
+        ``digests`` and `more`.
     """
     # nine digits tell all 32-bit numbers apart; no -0
     rows = [[float(f"{value + 0:.9g}") for value in row] for row in camera_to_world]
