@@ -82,6 +82,9 @@ _ONLY_A_LINK = re.compile(
     rf"\s*(?:[-*] )?(?:{_ADDRESS}|!?\[[^\]]*\]\(\S+\)|\[!\[.*\]\(\S+\)"
     r"|<(?:img|a|source) [^>]*>)[.,;:]?\s*$"
 )
+# In docstrings: a name that a description follows, and a line of a simple table.
+_ARGUMENT = re.compile(r"(?<=^    )\w+(?=: )", re.M)
+_BORDER = re.compile(r"=+(?: +=+)+")
 
 
 @dataclass(frozen=True, order=True)
@@ -226,7 +229,20 @@ def docstrings(source: str) -> Iterator[Passage]:
         for expression in node.body:
             value = expression.value if isinstance(expression, ast.Expr) else None
             if isinstance(value, ast.Constant) and isinstance(value.value, str):
-                yield Passage(value.lineno, inspect.cleandoc(value.value), False)
+                text = _as_markdown(inspect.cleandoc(value.value))
+                yield Passage(value.lineno, text, False)
+
+
+def _as_markdown(docstring: str) -> str:
+    """Mark names of arguments as code, and simple tables as tables; keep the lines."""
+    lines, borders = _ARGUMENT.sub(r"`\g<0>`", docstring).split("\n"), 0
+    for index, line in enumerate(lines):
+        if _BORDER.fullmatch(line):
+            borders = (borders + 1) % 3
+            lines[index] = "|---|" if borders == 2 else ""
+        elif borders:
+            lines[index] = f"| {line} |"
+    return "\n".join(lines)
 
 
 def _public(
