@@ -70,9 +70,13 @@ _MACHINES = re.compile(
     r"\b(?:AMD|EPYC|Xeon|Ryzen|Threadripper|Intel Core|Core i\d|Graviton|Apple M\d"
     r"|[AHV][12]00|RTX \w+|GTX \w+|Tesla [A-Z]\d+)\b"
 )
-# Results that may name machines.
-_PAGES = "bench.md car.md fields.md gpu.md retrain.md training.md table2/ methods/ matrix/"
-_RESULTS = tuple(f"docs/results/{x}" for x in _PAGES.split())
+# Pages of results may name machines.
+_PAGES = "bench car fields gpu retrain training".split()
+_TABLES = "table2 methods matrix".split()
+_RESULTS = (
+    *(f"docs/results/{page}.md" for page in _PAGES),
+    *(f"docs/results/{table}/" for table in _TABLES),
+)
 
 _SENTENCE_END = re.compile(r"(?<!\.\.)[.!?][)\]\"'”’*]*\s+")
 _ABBREVIATION = re.compile(r"\b(?:e\.g|i\.e|cf|vs|approx|et al|Fig|Eq|Sec)\.\s+$")
