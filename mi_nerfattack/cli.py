@@ -1,7 +1,8 @@
 """The command line: arguments, exit codes and messages, no logic.
 
 Exit codes: 0 done, 1 a command's own negative answer, 2 usage or input,
-130 interrupted, 141 nobody reads the output. docs/reference/commands.md tells users.
+130 interrupted, 141 nobody reads the output. docs/reference/commands.md lists them for
+users.
 """
 
 from __future__ import annotations

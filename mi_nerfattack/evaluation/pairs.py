@@ -30,8 +30,8 @@ class Effect:
 
     Attributes:
         attacks: that were compared, n of all intervals.
-        drives: pairs of drives whose means they are; several of one start and side,
-            such as random looks, count as one.
+        drives: pairs of drives whose means they are; several drives of one start and
+            side, such as those with random textures, count as one.
         unpaired: starts of either side without a partner, which were left out.
         seeds: fewest of a scenario.
         one: mean of one side over the attacks.
@@ -39,9 +39,10 @@ class Effect:
         difference: mean of one side less the other.
         difference_ci95: over the attacks, see `summary.interval`; None for few.
         iqm: interquartile mean of the differences.
-        iqm_ci95: likewise; None also where too few differences differ.
+        iqm_ci95: over the attacks; None for few attacks, and where too few differences
+            differ.
         ratio: of the means; None where one of the other side's is 0 or less.
-        ratio_ci95: likewise; None without a ratio or for few attacks.
+        ratio_ci95: over the attacks; None for few attacks, and without a ratio.
         spread: standard deviation of the difference from seed to seed, pooled over the
             scenarios; None where none has two seeds.
     """

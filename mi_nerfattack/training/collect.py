@@ -65,7 +65,7 @@ def collect(
         folder: gets `<site.name>/shard_0000.safetensors` and so on.
         workers: who renders.
         progress: called now and then; an exception from it stops the work.
-        staging: what stands beside which stretch; random objects by default.
+        staging: what is at the roadside of each stretch; random objects by default.
 
     Returns:
         The shards, in order.

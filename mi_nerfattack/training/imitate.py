@@ -81,10 +81,10 @@ def imitate(
         staging: of all collections, see `collect`.
 
     Raises:
-        InputError: before the first frame, no frames wanted, an unknown site, one
-            that cannot be opened, a camera, a route, first weights or frames of `more`
-            that do not fit, objects without a place, or another process that works in
-            the folder; then, where the folder holds what was made with other settings.
+        InputError: before the first frame, no frames are wanted, or another process
+            works in the folder. A site is unknown or cannot be opened, or objects find
+            no place. A camera, a route, first weights or frames of `more` do not fit.
+            Later, the folder holds results of other settings.
     """
     _check_wanted(sites, routes, settings, more)
     _check_policy(sites, routes, settings, more)

@@ -99,7 +99,7 @@ def fit_policy(
         checkpoint: safetensors file of the whole state, or None.
         device: torch device of the computation.
         progress: called after each step; an exception from it ends the training.
-        held_out: frames of another collection for the loss, in place of a part of
+        held_out: frames of another collection for the loss, instead of a part of
             `data`.
         validation: in the closed loop; None for none.
 
@@ -145,7 +145,7 @@ class Part:
         return cls(data, np.arange(len(data)))
 
     def describe(self) -> list[Any]:
-        """Return what tells parts apart: number of rows, checksum of the data."""
+        """Return the number of rows and the checksum of the data."""
         return [len(self.rows), self.data.digest]
 
 

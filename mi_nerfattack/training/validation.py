@@ -45,7 +45,7 @@ class Epoch(Measured):
 
 
 class AbstractValidation(ABC):
-    """Measurement of a policy beside its loss.
+    """Measurement of a policy besides its loss.
 
     Attributes:
         every: epochs from one measurement to the next; the last is always measured.
@@ -91,7 +91,7 @@ class ClosedLoop(AbstractValidation):
     Args:
         environments: with different names.
         routes: to drive.
-        objects: stand beside the road; may be empty.
+        objects: fields of the roadside objects; may be empty.
         surroundings: of the objects; None without.
         settings: number of drives, starts, cases.
         every: epochs from one measurement to the next.

@@ -20,7 +20,7 @@ _RANDOM_FIRST = 10
 
 
 class BayesianSearch(AbstractSearch):
-    """Fits a Gaussian process to what was told, and asks where it expects a gain.
+    """Fits a Gaussian process to all objectives, and asks where it expects a gain.
 
     Args:
         basis: of the textures, at most 64 coefficients.
