@@ -25,6 +25,7 @@ _FASTEST_MS, _FARTHEST_M = 1.5, 5.0
 @dataclass(frozen=True)
 class Calibrate:
     """Find the scales of a car's motor and steering servo, and write them to a file.
+
     Makes three short drives, straight, to the left and to the right; you measure each
     with a tape. It asks before the car moves, and the car moves only while you hold a
     button. Letting the button go brakes, as Ctrl-C does. A file next to the output

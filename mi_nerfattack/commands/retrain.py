@@ -38,13 +38,13 @@ FRAMES = {"surrogate": 2048, "mitsuba": 3072}
 class Retrain:
     """Fine-tune the policy that the attacks were found on, with frames of the attacks.
 
-    Drives past the attacks, those held out too. Collects frames of the attacked
-    objects, labelled by the expert; trains the policy further on them and on older ones
-    (--more), or lets --command train it; and drives again. Only runs count whose
-    scenario the expert itself can drive. Stopped, it continues from DATA. With more
-    --held-out or --adaptive it continues, too, without training again. Next to the
-    policy it writes NAME-retrain.json, the runs and errors before and after. Its own
-    training also writes program and record.
+    Drives past the attacks of all runs, the held-out runs too. Collects frames of the
+    attacked objects, labelled by the expert. Trains the policy further on these frames
+    and on older ones (--more), or lets --command train it. Then drives again. Only runs
+    count whose scenario the expert itself can drive. Stopped, it continues from DATA.
+    With more --held-out runs or --adaptive it continues without training again. Next to
+    the policy it writes NAME-retrain.json, with the runs and errors before and after.
+    Without --command or --module it also writes program and record of the training.
     """
 
     continues: ClassVar[bool] = True

@@ -56,7 +56,7 @@ class Check:
 
     Attributes:
         world: what the scenario describes; it stays as it was.
-        on_progress: told of a stage, units done, all units, and a remark.
+        on_progress: called with a stage, units done, all units, and a remark.
         refused: why `attack` would refuse the scenario, a sentence each.
         doubts: what it would not refuse, and is seldom meant.
         cost: None where no attack could be tried.

@@ -65,7 +65,7 @@ def read_run(folder: Path, label: str, repeat: str | None = None) -> RunPart:
 
     Args:
         folder: of a finished run.
-        label: that tells it from others on the page.
+        label: name of the run on the page, different from other names.
         repeat: the command that makes it again; that of its scenario by default.
 
     Raises:

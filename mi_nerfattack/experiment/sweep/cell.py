@@ -35,9 +35,9 @@ class Cell:
     """A row of the grid, with the whole scenario.
 
     Attributes:
-        route: name of the choice.
-        objects: likewise.
-        method: likewise.
+        route: name of the grid's choice of route.
+        objects: name of the grid's choice of objects.
+        method: name of the grid's choice of method.
         budget: rendered frames that the attack may cost; None: as the scenario says.
         seed: of the scenario.
         text: the scenario file, its paths absolute.

@@ -29,7 +29,7 @@ class Forecast:
     Attributes:
         cells: all.
         folder: of the sweep, which may be missing; None if nobody says.
-        on_progress: told of a stage, units done, all units, and a remark.
+        on_progress: called with a stage, units done, all units, and a remark.
         refused: why `attack` would refuse the cells of a place, a sentence each.
         doubts: what it would not refuse, and is seldom meant.
         costs: of one attack of each place, method and budget; None where none could

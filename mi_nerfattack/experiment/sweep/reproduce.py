@@ -66,8 +66,9 @@ def read_replay(
         seed: of that.
 
     Raises:
-        InputError: the table is missing or wrong; there is no such row, it tells of a
-            failure, or what it was made of is of other content here.
+        InputError: the table is missing or wrong, or there is no such row. The row is
+            of a cell that failed, or the files that its cell was made of have other
+            content here.
     """
     path = folder / RESULTS
     whole_table = read_table(path)
@@ -129,12 +130,13 @@ def compare_rows(
         errors: of cells that failed, by cell.
 
     Returns:
-        ``rows``: of each that was asked for its index, labels, `FIGURES` ``stored`` and
-        ``repeated``, and their absolute ``difference`` (null where there is no such
-        drive this time); ``cells``: of each, how many ``rows`` are compared, how many
-        are ``unmatched``, on either side, the ``largest_difference`` of all, what
-        ``versions`` differ (there, here), and its ``error``; ``largest_difference`` of
-        the rows that were asked for, null where none is there.
+        ``rows``: one per row of the replay, with index, labels, the `FIGURES`
+        ``stored`` and ``repeated``, and their absolute ``difference``. Figures are null
+        where there is no such drive this time. ``cells``: one per cell. ``rows`` counts
+        the compared rows, and ``unmatched`` the rows of one table alone. The others are
+        the ``largest_difference`` of all rows, the ``versions`` that differ (there,
+        here), and the cell's ``error``. ``largest_difference``: of the ``rows``, null
+        if none was repeated.
     """
     stored, again = (
         table[table["status"] == "complete"].set_index(_DRIVE)[FIGURES]

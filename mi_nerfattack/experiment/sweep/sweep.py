@@ -91,7 +91,7 @@ class Sweep:
         work: its cells.
         on_change: called when anything has happened.
         taken: cells that were done elsewhere; one that is done here, too, is not used.
-        steps: control periods that cells have told of.
+        steps: control periods that the cells have reported.
         complete: cells that are done, by their index.
         kept: how many were when this run began.
         errors: why others failed when they were tried last.

@@ -146,9 +146,8 @@ def write_heat(
 ) -> None:
     """Write a picture with two rows per object and one column per side.
 
-    The first row of an object shows its appearance, the second row shows its heat.
-
-    The colours of all objects have one scale, from zero to the 99.5th percentile.
+    The first row of an object shows its appearance, the second row shows its heat. The
+    heat of all objects has one scale, from zero to the 99.5th percentile.
 
     Args:
         path: PNG file.
