@@ -215,7 +215,7 @@ def _overview(themes: Mapping[str, Commands], about: str, prog: str) -> str:
             lines += textwrap.wrap(
                 first, 80, initial_indent=f"  {name:10}", subsequent_indent=" " * 12
             )
-    lines += ["", f"{prog} COMMAND --help tells the options of a command.", _HINT]
+    lines += ["", f"{prog} COMMAND --help shows the options of a command.", _HINT]
     return "\n".join(lines)
 
 

@@ -82,7 +82,7 @@ class Group:
 Commands = Mapping[str, "type[Command] | Group"]
 
 _CAR = Group(
-    "A small real car, or one in the simulated room, and an attacked box beside it.",
+    "A small real car, or one in the simulated room, and an attacked box next to it.",
     {
         "calibrate": Calibrate,
         "drive": DriveCommand,

@@ -22,10 +22,10 @@ class CertifyRobustness:
 
     Drives past random changes of the textures' low frequencies. The share of departures
     gives a bound for every change within a radius, for drives under this noise. The
-    table also shows the best attack that a search finds within the radius. Choose
-    --runs before the first result: the confidence holds for one number of runs.
-    Finished drives are kept, so the same command continues after Ctrl-C. More radii add
-    drives, and the bounds of all radii hold together.
+    table also shows the best attack that a search finds within the radius. Choose the
+    number of --runs before the first result, because the confidence holds for a fixed
+    number. Finished drives are kept, so the same command continues after Ctrl-C. More
+    radii add drives, and the bounds of all radii hold together.
     """
 
     continues: ClassVar[bool] = True

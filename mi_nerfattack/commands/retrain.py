@@ -36,15 +36,15 @@ FRAMES = {"surrogate": 2048, "mitsuba": 3072}
 
 @dataclass(frozen=True)
 class Retrain:
-    """Fine-tune the policy that the attacks were found on, with frames of the attacks.
+    """Fine-tune the attacked policy, with frames of the attacks.
 
-    Drives past the attacks of all runs, the held-out runs too. Collects frames of the
-    attacked objects, labelled by the expert. Trains the policy further on these frames
-    and on older ones (--more), or lets --command train it. Then drives again. Only runs
+    Drives past the attacks of all runs, held-out runs too. Collects frames of the
+    attacked objects, labelled by the expert. Trains the policy further on these and on
+    older frames (--more), or lets --command train it. Then drives again. Only runs
     count whose scenario the expert itself can drive. Stopped, it continues from DATA.
-    With more --held-out runs or --adaptive it continues without training again. Next to
-    the policy it writes NAME-retrain.json, with the runs and errors before and after.
-    Without --command or --module it also writes program and record of the training.
+    With more --held-out or --adaptive it continues without training again. Next to the
+    policy it writes NAME-retrain.json, with the errors before and after. Its own
+    training also writes program and record.
     """
 
     continues: ClassVar[bool] = True
