@@ -29,7 +29,7 @@ class Freedom:
         texture_rate: Adam's, in colours (sRGB in 0 to 1); None leaves textures alone.
         colouring: makes what is stepped in, of each object's field.
         pose_rate: Adam's, in metres and radians; None leaves poses alone.
-        axes: of `AXES`, along and about which objects may move (world axes).
+        axes: world axes, of `AXES`, along and about which objects may move.
         limit_m: largest shift along an axis; offsets are projected onto it after each
             update.
         limit_rad: largest component of the rotation vector of an object, radians;

@@ -258,11 +258,11 @@ def evaluate_policy(
     """Drive a policy in the closed loop: ``mi-nerfattack evaluate``.
 
     Args:
-        policy: a scenario (TOML), which is driven in its own scene, or what else the
-            command takes as a policy.
-        folder: of the drives; those that are finished are not repeated.
+        policy: a scenario (TOML), which is driven in its own scene, or another policy
+            that the command takes.
+        folder: of the drives; finished drives are not repeated.
         environments: names of environments.
-        routes: by name; all by default, of a scenario its own.
+        routes: by name; by default all routes, or the route of the scenario.
         runs: drives of each environment, route and case.
         objects: numbers of objects with random textures at the roadside, one case per
             number.

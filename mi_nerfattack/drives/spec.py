@@ -23,7 +23,7 @@ class DriveSpec:
     Args:
         environment: its label in documents.
         route: name.
-        case: what objects show.
+        case: name of the case, which says what the objects show.
         run: index among the drives of one route, environment and case, from 0.
         seed: of the environment.
         steps: control periods, at most.

@@ -151,12 +151,12 @@ def evaluate_run(
         environment: shows nothing but its world afterwards.
         policy: drives.
         route: from its start.
-        case: one of the settings', or `EXPERT`.
+        case: one of the cases of `settings`, or `EXPERT`.
         run: number of the drive, from 0.
         objects: fields of the roadside objects, used in turns; they have their
             original textures again at the end.
-        surroundings: of the objects; None in the case without.
-        settings: see there.
+        surroundings: of the objects; None in the case without objects.
+        settings: of the evaluation.
         on_step: called after each step.
     """
     pose, seed = drawn_start(settings, route, run)
@@ -306,12 +306,12 @@ def place_objects(
 
     Args:
         period: seconds between two images.
-        route: that is driven.
+        route: of the drive.
         count: how many objects.
         run: number of the drive; other runs begin with other objects.
         objects: all that there are; they get the textures.
-        surroundings: theirs; None without objects.
-        settings: see there.
+        surroundings: of the objects; None without objects.
+        settings: of the evaluation.
 
     Raises:
         InputError: the objects are too few, or do not find a place.

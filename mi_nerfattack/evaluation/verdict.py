@@ -312,7 +312,7 @@ def noise_larger(effect: Effect, figure: str) -> Iterator[str]:
 
     Args:
         effect: of several seeds; an effect of one seed gives no warning.
-        figure: what it is of, in words.
+        figure: name of the compared figure, in words.
     """
     if effect.spread is not None and abs(effect.difference) < effect.spread:
         yield _noise_told(figure, effect.difference, effect.spread, "seed to seed")

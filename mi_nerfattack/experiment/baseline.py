@@ -106,7 +106,7 @@ class Judgements(AbstractWork):
         folder: of the files.
         identity: of the run.
         scenario: of the run.
-        here: judges in this process; another process builds its own.
+        here: the judge of this process; another process builds a judge.
     """
 
     folder: Path
@@ -212,7 +212,7 @@ class Baseline:
 
         Args:
             work: their judgements.
-            workers: who does those that are missing.
+            workers: processes for the missing judgements.
             progress: called with control periods done and wanted.
             on_judged: called with the frames of each judgement.
 

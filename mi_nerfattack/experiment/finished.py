@@ -33,7 +33,7 @@ class Finished:
     """What a run came to.
 
     Attributes:
-        world: what was driven in; its textures are changed by what looks at it.
+        world: of all drives; functions that show a case change its textures.
         drives: all drives.
         attack: the finished attack.
         looks: by case, the appearance and place of the objects; None: no objects.

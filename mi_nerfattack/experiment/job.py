@@ -80,7 +80,7 @@ class Job:
         on_notice: called with a sentence, such as what a continued run ignores.
         started: `time.perf_counter()` from which the wall time counts.
         frames: of each case, see ``pictures.frames.frame_steps``; None writes no
-            pictures at all: no frames, plots, attribution and page.
+            frames, plots, attribution and page.
         shared: folder of drives that other runs have in common with this one, if any.
         workers: who does the drives.
     """

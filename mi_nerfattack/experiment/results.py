@@ -83,7 +83,7 @@ def write_results(
 
     Args:
         output: the run folder, present.
-        done: what the run came to.
+        done: results of the run.
         effort: returns the cost of the run so far.
         on_progress: called after every time step of attribution and frames.
         on_notice: called with a sentence that names the safe files if pictures fail.

@@ -69,10 +69,10 @@ def imitate(
     Everything slow is kept in the folder: the same call continues where it stopped.
 
     Args:
-        sites: with different names; those of `settings`.
-        routes: to drive; the policy has goals from 0 to their largest, or as many as
-            the first weights.
-        settings: see there.
+        sites: with different names; the sites of `settings`.
+        routes: to drive; the policy has goals from 0 to their largest goal, or as many
+            as the first weights.
+        settings: of collections, training and validation.
         folder: of frames and checkpoints.
         workers: who collects.
         progress: called often; an exception from it stops the work.

@@ -31,7 +31,7 @@ class TrainingRecord(Record):
         best_round: whose weights the policy has.
         command: that was given.
         seed: of the training.
-        settings: `ImitationSettings`, without those that others override.
+        settings: `ImitationSettings`, without settings that others override.
         augmentation: of the images.
         data: frames by collection.
         sites: where the frames come from.

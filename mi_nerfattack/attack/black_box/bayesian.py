@@ -27,7 +27,7 @@ class BayesianSearch(AbstractSearch):
         seed: of all draws.
 
     Raises:
-        InputError: more coefficients.
+        InputError: the basis has more coefficients.
         SetupError: Optuna is not installed.
 
     Source: Hvarfner et al., ICML 2024 (dimension-scaled priors); Optuna's `GPSampler`.

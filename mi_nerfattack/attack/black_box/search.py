@@ -150,7 +150,7 @@ class BlackBoxAttack:
         """Replay the history of another search of this kind and seed in a new search.
 
         Raises:
-            InputError: the rows are not those of a history.
+            InputError: the tensor does not have the shape of a history.
             KeyError: there is no history.
         """
         rows = tensors["history"]

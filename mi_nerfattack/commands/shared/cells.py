@@ -27,7 +27,7 @@ def do_cells(
     workers: AbstractWorkers,
     taken: Taken | None = None,
 ) -> Sweep:
-    """Do all cells that are not complete; returns what became of them.
+    """Do all cells that are not complete, and return the sweep with their results.
 
     Args:
         cells: of the sweep.

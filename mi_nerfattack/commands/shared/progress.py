@@ -76,7 +76,7 @@ class StageBars:
         """Show how far a stage is, and how long it will take.
 
         Args:
-            stage: its name; the first call with a name adds a bar.
+            stage: name of the stage; the first call with a name adds a bar.
             done: units of work done.
             total: units of the whole stage.
             state: text next to the bar.

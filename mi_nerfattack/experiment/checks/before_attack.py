@@ -127,11 +127,11 @@ def first_findings(world: World, one: One) -> Iterator[str]:
     - the objects are next to the lane, on the ground, in the open and apart.
 
     Args:
-        world: objects look and stand as the scenario says.
-        one: makes the drives, or has them.
+        world: with textures and places of objects as the scenario says.
+        one: makes the drives, or reads finished drives.
 
     Yields:
-        a sentence each: what, where, and the remedy.
+        one sentence per finding: the problem, its place, and the remedy.
     """
     yield from route_findings(world)
     first = one(SURROGATE, OWN, 0)

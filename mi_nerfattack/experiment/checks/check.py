@@ -57,8 +57,8 @@ class Check:
     Attributes:
         world: what the scenario describes; it stays as it was.
         on_progress: called with a stage, units done, all units, and a remark.
-        refused: why `attack` would refuse the scenario, a sentence each.
-        doubts: what it would not refuse, and is seldom meant.
+        refused: why `attack` would refuse the scenario, one sentence per reason.
+        doubts: settings that `attack` accepts but users seldom mean.
         cost: None where no attack could be tried.
         drives: that were made, unattacked.
         frames: the first of each environment.

@@ -66,7 +66,8 @@ def read_run(folder: Path, label: str, repeat: str | None = None) -> RunPart:
     Args:
         folder: of a finished run.
         label: name of the run on the page, different from other names.
-        repeat: the command that makes it again; that of its scenario by default.
+        repeat: the command that makes the run again; by default ``attack`` with its
+            scenario.
 
     Raises:
         InputError: it holds no finished run, or a file is damaged.

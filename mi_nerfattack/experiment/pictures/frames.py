@@ -163,7 +163,7 @@ def write_frames(
 
     Args:
         output: the run folder.
-        done: what the run came to.
+        done: results of the run.
         frames: which frames become files.
         on_progress: called after every time step with stage, steps and a remark.
     """

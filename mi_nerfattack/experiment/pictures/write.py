@@ -48,7 +48,7 @@ def write_images(
     Args:
         output: the run folder; what an earlier run left of attribution and videos is
             removed.
-        done: what the run came to; the objects look different afterwards.
+        done: results of the run; the objects have other textures afterwards.
         history: one record per iteration of the attack.
         frames: which frames become files.
         on_progress: called after every time step of attribution and frames.

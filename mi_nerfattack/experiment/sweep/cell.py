@@ -44,7 +44,7 @@ class Cell:
         digests: of the scenario and the files that it names.
         anyway: attack although the checks before find that it proves nothing.
         pictures: write frames, plots and page, too.
-        name: of the folder, where it is not that of route to digest.
+        name: of the folder, if it is not made from route to digest.
     """
 
     route: str

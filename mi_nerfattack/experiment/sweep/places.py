@@ -64,8 +64,8 @@ class Places:
 
         Args:
             section: what is drawn.
-            seed: of the draw; each route has random numbers of its own.
-            scenario: its deployment scene, routes, drive, vehicle and camera count.
+            seed: of the draw; each route has different random numbers.
+            scenario: gives deployment scene, routes, drive, vehicle and camera.
 
         Returns:
             the keys of each object in a scenario.

@@ -258,7 +258,7 @@ class Taken:
 
     Attributes:
         rows: of the table, of each complete cell.
-        made: what these cells were made of.
+        made: programs and files that made these cells.
         attacks: of the summary, by cell.
     """
 

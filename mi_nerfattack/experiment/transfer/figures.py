@@ -247,7 +247,7 @@ def run_transfer(
     ``transfer.json`` is written again whenever a row is whole.
 
     Args:
-        work: all drives, those of `output`.
+        work: all drives; their store is in `output`.
         output: the folder, see `check_output`.
         workers: who does them.
         progress: called with control periods done and wanted.

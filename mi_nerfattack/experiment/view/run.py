@@ -50,7 +50,7 @@ class ViewedRun:
             name: see :func:`drive_name`; by default the attack in the surrogate.
 
         Raises:
-            InputError: there is none of that name.
+            InputError: no drive has that name.
         """
         names = {drive_name(drive): drive for drive in self.shown}
         name = name or f"{SURROGATE}: {ATTACK}"
@@ -70,7 +70,7 @@ class ViewedRun:
         """Return where the objects stand.
 
         Args:
-            case: of a drive; without objects, where they would be.
+            case: of a drive; a case without objects gives the places of `attack`.
             moved: offsets (6,) by number of the object, instead of the case's offsets.
         """
         self.show(case if self.looks[case] is not None else ATTACK, moved)

@@ -88,7 +88,7 @@ class Scrubber:
     """Panes next to each other, each with the same number of pictures.
 
     Attributes:
-        title: of them all.
+        title: above all panes.
         panes: at least one.
         start: index of the picture that is shown first.
         period_s: seconds that a picture is shown for when they play.
@@ -187,7 +187,7 @@ class SweepPart:
         document: as of `sweep.summary.summarise`.
         attacks: one row per cell and environment: labels, figures by case, and the
             command that repeats the cell.
-        shown: of each route and method the cell of middle damage.
+        shown: one cell per route and method, the cell of middle damage.
         pictures: image files by title.
         notes: what is missing, and which command makes it.
     """

@@ -83,7 +83,7 @@ def write_policy_page(
     """Write `NAME.md`, `NAME.card.json` and `NAME.png`.
 
     Args:
-        folder: exists; NAME is that of the policy's file.
+        folder: an existing folder; NAME is the name of the policy's file.
         about: of the evaluation, JSON: `policy`, `command`, `settings`,
             `environments`, `versions`, `seconds_a_drive` and more.
         record: of the policy's training; None without a record.

@@ -28,7 +28,7 @@ class Subject:
 
     Attributes:
         use: what the field must be good enough for.
-        views: what judges it.
+        views: name of the views that judge the field.
         reach: from where it is good enough, according to the views.
         few: advice where there are few views.
         blurred: where the mean PSNR is low.

@@ -59,7 +59,7 @@ def write_depths(
         path: PNG file.
         views: at least one, with their pictures, all of one size.
         unit: of the depths, for the labels.
-        titles: of the column of the field, and of that of what is known.
+        titles: of the columns with the field's depth and with the known depth.
     """
     pictures = _pictures(views)
     shown = [pair.shown.solid_depth for pair in pictures]
