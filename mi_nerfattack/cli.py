@@ -1,7 +1,8 @@
 """The command line: arguments, exit codes and messages, no logic.
 
 Exit codes: 0 done, 1 a command's own negative answer, 2 usage or input,
-130 interrupted, 141 nobody reads the output. docs/reference/commands.md tells users.
+130 interrupted, 141 nobody reads the output. docs/reference/commands.md lists them for
+users.
 """
 
 from __future__ import annotations
@@ -214,7 +215,7 @@ def _overview(themes: Mapping[str, Commands], about: str, prog: str) -> str:
             lines += textwrap.wrap(
                 first, 80, initial_indent=f"  {name:10}", subsequent_indent=" " * 12
             )
-    lines += ["", f"{prog} COMMAND --help tells the options of a command.", _HINT]
+    lines += ["", f"{prog} COMMAND --help shows the options of a command.", _HINT]
     return "\n".join(lines)
 
 

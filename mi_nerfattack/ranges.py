@@ -51,7 +51,9 @@ _STRICT = ConfigDict(extra="forbid", strict=True)
 
 
 def checked(owner: str = "") -> Callable[[type[_T]], type[_T]]:
-    """Let a dataclass check its fields when an object is made; stands below it.
+    """Let a dataclass check its fields when an object is made.
+
+    Write ``@dataclass`` above it, so that the dataclass's ``__init__`` runs the check.
 
     A field whose type is a range or a kind of word, or a mapping or alternative with
     one, raises `InputError` for another type or a value outside. A `__post_init__` of

@@ -29,10 +29,11 @@ class Freedom:
         texture_rate: Adam's, in colours (sRGB in 0 to 1); None leaves textures alone.
         colouring: makes what is stepped in, of each object's field.
         pose_rate: Adam's, in metres and radians; None leaves poses alone.
-        axes: of `AXES`, along and about which objects may move (world axes).
+        axes: world axes, of `AXES`, along and about which objects may move.
         limit_m: largest shift along an axis; offsets are projected onto it after each
             update.
-        limit_rad: largest component of the rotation vector, likewise.
+        limit_rad: largest component of the rotation vector of an object, radians;
+            projected in the same way.
 
     Raises:
         InputError: nothing is left to change, or an axis is unknown.
@@ -177,10 +178,10 @@ class AbstractAttack(ABC):
 
     @abstractmethod
     def curve(self, backward_multiple: float) -> np.ndarray:
-        """Return the best so far against the cost, a row a measurement.
+        """Return the best objective so far and its cost, one row per measurement.
 
         Args:
-            backward_multiple: cost of a pass back, in drives.
+            backward_multiple: cost of a backward pass, in drives.
 
         Returns:
             (n, 3): see :func:`best_so_far`.
@@ -213,7 +214,7 @@ class AbstractAttack(ABC):
 
     @property
     def judged_objective(self) -> float:
-        """Least objective, as random looks are judged; once finished."""
+        """Least objective, measured as for random textures; once finished."""
         return self.best_objective
 
     @property
@@ -222,7 +223,7 @@ class AbstractAttack(ABC):
         return not self.history or np.isfinite(self.best_objective)
 
     def judge_best(self, on_step: Callable[[int], None] | None = None) -> None:
-        """Measure the best parameters anew; costs one drive.
+        """Measure the best parameters again; costs one drive.
 
         Args:
             on_step: called after each control period.

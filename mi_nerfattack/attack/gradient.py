@@ -177,7 +177,7 @@ class GradientAttack(AbstractAttack):
     def curve(self, backward_multiple: float) -> np.ndarray:
         """See ``AbstractAttack.curve``; once finished, the last update counts too.
 
-        A measurement is a drive, after which an update takes a pass back.
+        A measurement is a drive; an update with its backward pass follows it.
         """
         records = [*self.history, *([self._last] if self._last else [])]
         drive = self.rollout.frames * len(self.initial[0])

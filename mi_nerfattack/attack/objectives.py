@@ -183,9 +183,10 @@ class AbsoluteDeviation:
 class HeadingDeviation:
     """Minus the angle to the lane's direction, rounded at zero.
 
-    ``-(sqrt(psi^2 + w^2) - w)`` with psi in (-pi, pi] from the nearest segment;
-    differentiable in the heading alone, for on a polyline the direction is constant
-    beside a segment. Where psi passes pi the derivative changes its sign.
+    ``-(sqrt(psi^2 + w^2) - w)``, where psi in (-pi, pi] is the angle of the heading
+    from the nearest segment of the lane. Differentiable in the heading alone, because
+    the direction of a polyline is constant along a segment. Where psi passes pi the
+    derivative changes its sign.
 
     Attributes:
         route: the lane centre.
@@ -226,16 +227,16 @@ class TargetDistance:
 class DepartureTime(AbstractObjective):
     """Expected time until the vehicle leaves its lane, seconds.
 
-    With ``p_t = sigmoid((limit - |e_t|) / softness)``, the chance to be in the lane
-    after t control periods, and ``S_t = p_1 ... p_t``, the chance to have been there
-    all the time, the cost is ``dt (S_1 + ... + S_T)``. As the softness goes to zero,
-    it becomes ``dt (k - 1)`` where the k-th period is the first that ends with
-    ``|e| > limit``, i.e. the time of the last state before the departure, and ``dt T``
-    where there is none.
+    ``p_t = sigmoid((limit - |e_t|) / softness)`` is the chance to be in the lane after
+    t control periods. ``S_t = p_1 ... p_t`` is the chance to have been in the lane in
+    all of them. The cost is ``dt (S_1 + ... + S_T)``. As the softness goes to zero, the
+    cost goes to ``dt (k - 1)``, where the k-th period is the first that ends with
+    ``|e| > limit``: the time of the last state before the departure. Without a
+    departure the cost goes to ``dt T``.
 
-    Far inside the lane the derivative fades as ``exp(-(limit - |e|) / softness)``,
-    and behind a departure it is that of nothing any more: take a softness of about a
-    third of the limit, or add some deviation by a weighted sum. At e = 0 the
+    Far inside the lane the derivative fades as ``exp(-(limit - |e|) / softness)``.
+    States after a departure add nothing to the derivative. So take a softness of about
+    a third of the limit, or add some deviation by a weighted sum. At e = 0 the
     derivative is zero.
 
     Attributes:

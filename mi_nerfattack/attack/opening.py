@@ -80,7 +80,7 @@ class Sides(AbstractOpening):
 
 @dataclass(frozen=True)
 class Restarts(AbstractOpening):
-    """Three tries, the first from the original, the others from random looks.
+    """Three tries: the first from the original, the others from random textures.
 
     Attributes:
         looks: the draws.

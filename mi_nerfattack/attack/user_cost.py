@@ -18,9 +18,10 @@ class UserCost:
 
     Attributes:
         name: of the function, for messages.
-        function: maps states (m, k), rows px, py (metres), theta (radians) and what
-            the dynamics add, to a row (k,) that the attack minimises, in Dr.Jit
-            operations in double precision; k vehicles and times are independent.
+        function: maps states (m, k) of k vehicles and times to costs (k,), which the
+            attack minimises. The rows of the states are px, py (metres), theta
+            (radians) and those that the dynamics add. The function takes and returns
+            Dr.Jit arrays in double precision. The k states are independent.
     """
 
     name: str

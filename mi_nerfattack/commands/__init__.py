@@ -1,10 +1,10 @@
 """The sub-commands of ``mi-nerfattack``, one file each.
 
-A command is a frozen dataclass: its fields are the arguments, their docstrings the
-help (`cli` has what ``output``, ``json`` and ``run_folder`` share), and ``run()`` does
-the work and returns the exit code or, where it prints figures, these, as a ``Result``;
-then it takes ``json``. These modules are all imported for ``--help``; import anything
-slow (torch, our own parts) inside run().
+A command is a frozen dataclass. Its fields are the arguments, and their docstrings are
+the help; `cli` has the help of ``output``, ``json`` and ``run_folder``, which commands
+share. ``run()`` does the work and returns the exit code. A command that prints figures
+returns them as a ``Result`` and takes ``json``. ``--help`` imports all these modules,
+so import anything slow (torch, our own parts) inside run().
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Group:
 Commands = Mapping[str, "type[Command] | Group"]
 
 _CAR = Group(
-    "A small real car, or one in the simulated room, and an attacked box beside it.",
+    "A small real car, or one in the simulated room, and an attacked box next to it.",
     {
         "calibrate": Calibrate,
         "drive": DriveCommand,

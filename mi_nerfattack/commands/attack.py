@@ -112,9 +112,11 @@ def _print_files(
 class Attack:
     """Optimise the textures of a scenario's objects until the policy leaves its lane.
 
-    Drives without objects, past the objects as they are, past random textures that
-    cost together what the attack does, past the best of them and past the attack, in
-    the surrogate and in the deployment environments that the scenario names; writes
+    Drives without objects, and drives past the objects with their original textures,
+    with random textures, with the best random texture and with the attack. The random
+    textures together cost as much as the attack. All drives are made in the surrogate
+    and in the deployment environments that the scenario names. The run folder gets
+    everything.
     everything to a run folder.
     """
 

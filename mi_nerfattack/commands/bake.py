@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 class Bake:
     """Bake a field along its routes, for faster attacks and drives.
 
-    The field is that of [scene], at its to_world, as the scenario's camera sees it from
-    all routes of its file. The bricks stand in the scenario as scene.bricks, or in the
-    field's place. They show nearly what the field shows; FILE.report beside them says
-    how nearly.
+    Bakes the field of [scene], at its to_world, as the scenario's camera sees it from
+    all routes of its file. Name the bricks in the scenario as scene.bricks, or as
+    scene.field instead of the field. Bricks and field show nearly the same; FILE.report
+    next to the bricks says how nearly.
     """
 
     scenario: tyro.conf.Positional[Path]

@@ -26,10 +26,10 @@ _FASTEST_MS, _FARTHEST_M = 1.5, 5.0
 class Calibrate:
     """Find the scales of a car's motor and steering servo, and write them to a file.
 
-    Three short drives, straight, to the left and to the right, each of which you
-    measure with a tape. It asks before anything moves, and moves only while a button
-    is held; letting it go brakes, as Ctrl-C does. What was measured is kept beside the
-    output until that is written: the same command goes on there.
+    Makes three short drives, straight, to the left and to the right; you measure each
+    with a tape. It asks before the car moves, and the car moves only while you hold a
+    button. Letting the button go brakes, as Ctrl-C does. A file next to the output
+    keeps your measurements until the output is written, so the same command continues.
     """
 
     continues: ClassVar[bool] = True

@@ -20,12 +20,12 @@ from mi_nerfattack.commands.shared.terminal import Result, console
 class CertifyRobustness:
     """Bound the chance of a departure for all small changes of the objects' textures.
 
-    Drives past random changes of the textures' low frequencies. From the share of
-    departures follows a bound for every change within a radius, of the drive under
-    this noise. Beside it stands the best attack that a search finds within the radius.
-    Choose --runs before the first result: the confidence holds for one number of runs.
-    Finished drives are kept: the same command continues after Ctrl-C. More radii add
-    to the drives, and all their bounds hold together.
+    Drives past random changes of the textures' low frequencies. The share of departures
+    gives a bound for every change within a radius, for drives under this noise. The
+    table also shows the best attack that a search finds within the radius. Choose the
+    number of --runs before the first result, because the confidence holds for a fixed
+    number. Finished drives are kept, so the same command continues after Ctrl-C. More
+    radii add drives, and the bounds of all radii hold together.
     """
 
     continues: ClassVar[bool] = True

@@ -29,15 +29,15 @@ class CompareDrives:
     """Recordings of real drives without the object, in the order of driving: videos
     with poses, folders or .mcap logs, as for replays."""
     own: Recordings = ()
-    """Likewise past the object as it is."""
+    """Recordings of drives past the object with its original texture."""
     random: Recordings = ()
-    """Likewise past random textures."""
+    """Recordings of drives past the object with random textures."""
     attack: Recordings = ()
-    """Likewise past the attack."""
+    """Recordings of drives past the object with the attack."""
     topics: tuple[str, ...] = ()
     """Topics of the logs, as of car overlay."""
     json: bool = False
-    """Print metrics.json in place of the table."""
+    """Print metrics.json instead of the table."""
 
     def run(self) -> Result:
         """Read, judge, write and print."""

@@ -1,4 +1,4 @@
-"""``mi-nerfattack render compare``: a field beside the scene that it shows."""
+"""``mi-nerfattack render compare``: a field and the scene that it shows, compared."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ class Demo:
     anyway: bool = False
     """Attack although the object would prove nothing; see attack."""
     json: bool = False
-    """End with one line of JSON, the content of metrics.json, in place of the table."""
+    """End with one line of JSON, the content of metrics.json, instead of the table."""
 
     @property
     def continues(self) -> bool:

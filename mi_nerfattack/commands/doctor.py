@@ -9,13 +9,13 @@ from mi_nerfattack.commands.shared.terminal import Result
 
 @dataclass(frozen=True)
 class Doctor:
-    """Check the installation, and say what to do about what is missing.
+    """Check the installation, and say how to get what is missing.
 
     The exit code is 0 where the main job can run, else 1.
     """
 
     json: bool = False
-    """Print one line of JSON in place of the table."""
+    """Print one line of JSON instead of the table."""
 
     developer: bool = False
     """Also list what only tests, checks of the code and the documentation need."""

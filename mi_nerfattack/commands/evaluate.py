@@ -39,10 +39,10 @@ _PERIOD_S = 0.1  # of a server while its map is read
 class Evaluate:
     """Drive a policy in the closed loop, per environment and route, and print its card.
 
-    Every drive starts at random near the route's start: once alone, once past each
-    number of objects with random textures. The expert drives from the same starts.
-    Finished drives are kept: the same command continues after Ctrl-C, and more runs or
-    numbers of objects add to them.
+    Each drive starts at random near the route's start: one drive alone, and one drive
+    past each number of objects with random textures. The expert drives from the same
+    starts. Finished drives are kept: the same command continues after Ctrl-C, and more
+    runs or numbers of objects add to them.
     """
 
     continues: ClassVar[bool] = True
@@ -258,13 +258,14 @@ def evaluate_policy(
     """Drive a policy in the closed loop: ``mi-nerfattack evaluate``.
 
     Args:
-        policy: a scenario (TOML), which is driven in its own scene, or what else the
-            command takes as a policy.
-        folder: of the drives; those that are finished are not repeated.
+        policy: a scenario (TOML), which is driven in its own scene, or another policy
+            that the command takes.
+        folder: of the drives; finished drives are not repeated.
         environments: names of environments.
-        routes: by name; all by default, of a scenario its own.
+        routes: by name; by default all routes, or the route of the scenario.
         runs: drives of each environment, route and case.
-        objects: numbers of objects with random textures beside the road, a case each.
+        objects: numbers of objects with random textures at the roadside, one case per
+            number.
         seed: of starts, places, textures and images.
         horizon: most control periods of a drive.
         spp: samples per pixel of path-traced images.

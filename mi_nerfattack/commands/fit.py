@@ -23,9 +23,9 @@ class Fit:
     """Fit a neural field to posed images, and score it on every 8th image.
 
     The same command continues an interrupted fit from its checkpoint. Without --bounds
-    the field's box is that of all depths in the folder or, without depth, of its
-    cameras and sparse points or, without these too, a cube around the point nearest to
-    all optical axes, four times as wide as the distance of the farthest camera.
+    the field's box holds all depths in the folder. Without depth, it holds the cameras
+    and sparse points. Without these too, it is a cube around the point nearest to all
+    optical axes, four times as wide as the distance of the farthest camera.
     """
 
     continues: ClassVar[bool] = True
@@ -46,7 +46,7 @@ class Fit:
     patience: int | None = None
     """End the fit when so many steps lower the loss by less than 1 %."""
     force: bool = False
-    """Start again, whatever an interrupted fit left beside the output."""
+    """Start again; an interrupted fit next to the output is not continued."""
     batch_rays: int = 16384
     """Rays of a step, at most."""
     network: Literal["instant-ngp", "small"] = "instant-ngp"

@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 class OverlayCommand:
     """Show the attacked cube of a run in a recorded drive, where a green target stands.
 
-    What stands before the target stays before the cube. Poses are the recording's own,
+    Things before the target also hide the cube. The poses are those of the recording,
     in metres and in the run's frame of the world.
     """
 
     recording: tyro.conf.Positional[Path]
-    """Video with a pose file of the same name beside it, folder of images with
+    """Video with a pose file of the same name next to it, folder of images with
     transforms.json, poses.csv or poses.toml, or .mcap log, as for replays."""
     run_folder: tyro.conf.Positional[Path]
     output: Path

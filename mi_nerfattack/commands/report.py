@@ -15,13 +15,14 @@ from mi_nerfattack.commands.shared.terminal import Result
 class Report:
     """Write one HTML page of results, which needs no network and no other file.
 
-    If OUTPUT ends with .md, the figures of one sweep or transfer are written between
-    two marks of that page, and their tables beside it; other text stays.
+    If OUTPUT ends with .md, the command writes the figures of one sweep or transfer
+    between two marks of that page, and their tables into files next to it. It keeps all
+    other text of the page.
 
-    Figures with flags first, drives from above, damage against cost, the matrix of
-    transfers, what the policy sees, frame by frame, the objects from all around, when
-    and where the failure is made, versions, checksums, and the command that makes each
-    row again.
+    The page shows figures with flags first, then drives from above, damage against cost
+    and the matrix of transfers. It shows the frames that the policy sees, the objects
+    from all around, and when and where the failure is made. It also lists versions,
+    checksums, and the command that makes each row again.
     """
 
     folders: Annotated[

@@ -18,9 +18,10 @@ from mi_nerfattack.commands.shared.terminal import Result
 class Reproduce:
     """Repeat rows of a sweep's table, and say by how much they differ.
 
-    The whole cell of each row is done anew, the attack first, as the sweep did it; the
-    table alone says how. Refused where a file that it was made of has another content.
-    Ends with 1 where a row differs by more than --tolerance, or its cell fails.
+    Repeats the whole cell of each row, beginning with the attack, as results.csv and
+    cells.json describe it. Refuses a row if a file that its cell was made of has other
+    content now. Ends with 1 if a row differs by more than --tolerance, or its cell
+    fails.
     """
 
     folder: tyro.conf.Positional[Path]
@@ -35,8 +36,8 @@ class Reproduce:
     """Folder for the repeated cells, itself a sweep's: the same command continues
     there. By default one that is removed at the end."""
     drives_only: bool = False
-    """Begin where the cells' own checkpoints in FOLDER end: repeat the drives alone,
-    past the textures that were found."""
+    """Begin where the cells' own checkpoints in FOLDER end: keep their textures and
+    repeat only the drives."""
     tolerance: float | None = None
     """Largest difference of a row's mean error, metres; by default any."""
     workers: int | None = None
@@ -44,7 +45,7 @@ class Reproduce:
     cores: int = 1
     """Cores that each cell renders with."""
     json: bool = False
-    """Print JSON in place of sentences."""
+    """Print JSON instead of sentences."""
 
     @property
     def continues(self) -> bool:

@@ -36,15 +36,15 @@ FRAMES = {"surrogate": 2048, "mitsuba": 3072}
 
 @dataclass(frozen=True)
 class Retrain:
-    """Fine-tune the policy that found attacks are on, among them.
+    """Fine-tune the attacked policy, with frames of the attacks.
 
-    Drives past the attacks, and past those held out; collects frames among the
-    attacked objects, labelled by the expert; trains the policy further on them and on
-    older ones (--more), or lets --command train it; and drives again. Only runs count
-    whose scenario the expert itself can drive. Stopped, it continues from DATA, and so
-    it does with more --held-out or --adaptive, without training again. Beside the
-    policy come NAME-retrain.json, the runs and errors before and after, and of our
-    training its program and record.
+    Drives past the attacks of all runs, held-out runs too. Collects frames of the
+    attacked objects, labelled by the expert. Trains the policy further on these and on
+    older frames (--more), or lets --command train it. Then drives again. Only runs
+    count whose scenario the expert itself can drive. Stopped, it continues from DATA.
+    With more --held-out or --adaptive it continues without training again. Next to the
+    policy it writes NAME-retrain.json, with the errors before and after. Its own
+    training also writes program and record.
     """
 
     continues: ClassVar[bool] = True
@@ -87,7 +87,7 @@ class Retrain:
     environments: tuple[str, ...] = ("surrogate", "mitsuba")
     """Environments of the drives before and after, as of 'transfer'."""
     runs: int = 4
-    """Drives before and after of each case: past an attack, and without objects."""
+    """Drives before and after of each case: with an attack, and without objects."""
     adaptive: bool = False
     """Attack the new policy in the same scenarios, too, which takes as long as the
     runs did."""

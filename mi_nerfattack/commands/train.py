@@ -35,10 +35,10 @@ _REFUSED = {
 class Train:
     """Train a driving policy on frames of any environments of a place.
 
-    Collects frames (three quarters with 1 to 6 objects of random texture beside the
-    road), trains PilotNet to imitate the expert, lets it drive and trains it on what it
-    saw (DAgger), and ends with its closed-loop error. Stopped, it continues from DATA.
-    Validation and program of the policy are written beside it.
+    Collects frames, three quarters of them with 1 to 6 objects of random texture at the
+    roadside. Trains PilotNet to imitate the expert, lets it drive and trains it on the
+    frames that it saw (DAgger). Ends with its closed-loop error. Stopped, it continues
+    from DATA. Validation and program are written next to the policy.
     """
 
     continues: ClassVar[bool] = True
@@ -60,7 +60,7 @@ class Train:
     field: Path | None = None
     """Field file of the scene, for the surrogate."""
     object: tuple[Path, ...] = ()
-    """Grid fields beside the road; the bundled hydrant."""
+    """Grid fields at the roadside; the bundled hydrant."""
     routes_file: Path | None = None
     """Routes file (.json); the preset's by default."""
     frames: dict[str, int] | None = None
@@ -96,7 +96,7 @@ class Train:
     runs: int = 2
     """Drives per case of the last validation."""
     most_objects: int | None = None
-    """Most objects beside the road in a frame; 0: none."""
+    """Most objects at the roadside in a frame; 0: none."""
     scale: tuple[float, ...] = ()
     """Least and most factor to the size, as of evaluate."""
     facing: Facing = "shape"

@@ -18,11 +18,12 @@ if TYPE_CHECKING:
 class Transfer:
     """Drive past found attacks, unchanged, in every environment and condition.
 
-    Drives start where the attacks were neither optimised nor evaluated: without
-    objects, past the objects as they were, past the best random look of each run and
-    past its attack. The folder has a table (transfer.json), which grows by a row at a
-    time, and a picture. Finished drives are kept: the same command continues after
-    Ctrl-C, and more runs, environments, conditions or starts add to them.
+    Drives start where no attack was optimised or evaluated. Each start has one drive
+    without objects, and drives past the objects with their original textures, with the
+    best random texture of the run and with its attack. The folder gets a table
+    (transfer.json), which grows row by row, and a picture. Finished drives are kept:
+    the same command continues after Ctrl-C, and more runs, environments, conditions or
+    starts add to them.
     """
 
     continues: ClassVar[bool] = True
@@ -62,10 +63,11 @@ class Transfer:
         "turn:10",
         "pitch:1",
     )
-    """Times of day, exposure (powers of two), noise (sRGB, of 1), blur (pixels),
-    dropped (share of frames), late (frames) and latency (controls) in control periods,
-    errors of placement (metres) and turn (degrees) of objects and of the camera's pitch
-    (degrees); several at once with commas: evening,noise:0.03."""
+    """Times of day. Of the camera: exposure (powers of two), noise (sRGB, of 1), blur
+    (pixels), dropped (share of frames), late (control periods) and pitch (error in
+    degrees). Of the car: latency of controls (control periods). Errors of objects:
+    placement (metres) and turn (degrees). Several at once with commas:
+    evening,noise:0.03."""
     cases: tuple[str, ...] = ("no_object", "own", "best_random", "attack")
     """What objects show."""
     runs: int = 4
@@ -78,7 +80,7 @@ class Transfer:
     """Processes that drive; one a core by default, 1 for policies behind a URL. 1
     drives in this process."""
     json: bool = False
-    """Print transfer.json in place of the table."""
+    """Print transfer.json instead of the table."""
 
     def run(self) -> Result:
         """Drive, summarise, print and write."""

@@ -17,9 +17,10 @@ if TYPE_CHECKING:
 class View:
     """Show a finished run in the browser, until Ctrl-C.
 
-    The place as points, the objects as the attack left them, all drives, and at any
-    time of a drive the frame that the policy saw, with where the attack acts, rendered
-    when it is asked for. Objects can be moved, and are rendered again.
+    The scene shows the place as points, the objects as the attack left them, and all
+    drives. At any time of a drive it shows the frame that the policy saw and where the
+    attack acts, rendered on request. You can move the objects, and they are rendered
+    again.
     """
 
     run_folder: tyro.conf.Positional[Path]
@@ -28,8 +29,8 @@ class View:
     """Write one HTML file, which opens by itself, and end: the scene, with one drive
     that plays."""
     drive: str | None = None
-    """Shown first, or written: ENVIRONMENT: CASE, as "mitsuba: attack"; past the
-    attack in the surrogate by default."""
+    """Shown first, or written: ENVIRONMENT: CASE, as "mitsuba: attack"; by default the
+    attack in the surrogate."""
     host: str = "127.0.0.1"
     """Name or address to listen at. Whoever gets there sees the run and moves its
     objects: this computer alone by default."""

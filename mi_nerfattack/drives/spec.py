@@ -23,12 +23,12 @@ class DriveSpec:
     Args:
         environment: its label in documents.
         route: name.
-        case: what objects show.
+        case: name of the case, which says what the objects show.
         run: index among the drives of one route, environment and case, from 0.
         seed: of the environment.
         steps: control periods, at most.
-        identity: all that decides about the drive, see `identify`.
-        how: what the driver needs to know, beside.
+        identity: everything that the result of the drive depends on, see `identify`.
+        how: what the driver needs besides; not part of the identity.
     """
 
     environment: str

@@ -123,7 +123,7 @@ def with_starts(table: pd.DataFrame, attack: str) -> pd.DataFrame:
 
     Args:
         table: with `case` and `run`.
-        attack: column that tells attacks apart.
+        attack: column with a different value for each attack.
     """
     others = table[table["case"] != RANDOM]
     starts = others.groupby(attack)["run"].max() + 1

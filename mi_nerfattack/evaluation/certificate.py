@@ -62,16 +62,16 @@ LEAST_COSINE, SLOPES = 0.5, (0.5, 2.0)
 
 @dataclass(frozen=True)
 class Agreement:
-    """How predicted changes of an objective agree with real ones.
+    """How predicted changes of an objective agree with real changes.
 
-    For normal directions of equal standard deviation, the slope goes to ``<g, p> /
-    <p, p>`` and the cosine to that between g and p, where g is the gradient of the
-    real objective and p the gradient that predicts.
+    Let g be the gradient of the real objective, and p the gradient that predicts. For
+    normal directions of equal standard deviation, the slope goes to ``<g, p> / <p, p>``
+    and the cosine to the cosine of the angle between g and p.
 
     Attributes:
         slope: least squares of real by predicted changes, through zero.
         slope_ci95: Student's interval.
-        cosine: between both.
+        cosine: of the angle between real and predicted changes.
         cosine_ci95: by Fisher's transformation.
     """
 

@@ -45,14 +45,14 @@ STARTS = Scatter(0.25, 0.75, np.deg2rad(3.0).item(), np.deg2rad(9.0).item(), 0.0
 class EvaluateSettings:
     """Choices of an evaluation; the same settings give the same drives.
 
-    Start, places and textures of a drive depend on seed, route, number of the drive
-    and number of objects alone: they are the same in every environment, the start with
-    any number of objects, and more runs or numbers of objects add drives.
+    The start of a drive depends on seed, route and number of the drive alone. Places
+    and textures also depend on the number of objects. All are the same in every
+    environment. More runs or numbers of objects add drives and change none.
 
     Args:
         runs: drives of each route, environment and case.
-        objects: numbers of objects with random textures beside the road, a case each;
-            every route is driven without, too.
+        objects: numbers of objects with random textures at the roadside, one case per
+            number; every route is driven without objects, too.
         seed: of starts, places and textures.
         margin_m: arc length before the end of an open route at which a drive ends.
         horizon: most steps of a drive.
@@ -94,7 +94,7 @@ class EvaluateSettings:
 
 
 class ExpertPolicy(AbstractPolicy):
-    """Driver that looks at an environment's state in place of the images.
+    """Driver that uses an environment's state instead of the images.
 
     Args:
         environment: in which it drives.
@@ -145,17 +145,18 @@ def evaluate_run(
     settings: EvaluateSettings,
     on_step: Callable[[int], None] | None = None,
 ) -> Drive:
-    """Drive once from a random start, alone or past objects of random texture.
+    """Drive once from a random start, alone or with objects of random texture.
 
     Args:
         environment: shows nothing but its world afterwards.
         policy: drives.
         route: from its start.
-        case: one of the settings', or `EXPERT`.
+        case: one of the cases of `settings`, or `EXPERT`.
         run: number of the drive, from 0.
-        objects: stand beside the road, in turns; their own textures come back.
-        surroundings: of the objects; None in the case without.
-        settings: see there.
+        objects: fields of the roadside objects, used in turns; they have their
+            original textures again at the end.
+        surroundings: of the objects; None in the case without objects.
+        settings: of the evaluation.
         on_step: called after each step.
     """
     pose, seed = drawn_start(settings, route, run)
@@ -229,7 +230,7 @@ def make_card(
     drives: Mapping[tuple[str, str, str], Sequence[Drive]],
     limits: Mapping[str, float],
 ) -> dict[str, Any]:
-    """Summarise drives, and set the expert's figures beside the policy's.
+    """Summarise drives, with the expert's figures next to the policy's.
 
     Args:
         drives: by environment, route and case.
@@ -237,8 +238,8 @@ def make_card(
 
     Returns:
         {ENVIRONMENT: {ROUTE: {CASE: figures}}} of JSON types, in the order of the
-        drives; the figures are those of `card_figures`, and those without objects
-        have the expert's as `expert`, None where it does not drive.
+        drives. The figures are those of `card_figures`. The case without objects also
+        has the figures of the expert as `expert`, None where the expert does not drive.
     """
     card: dict[str, Any] = {}
     for (label, route, case), group in drives.items():
@@ -256,7 +257,7 @@ def make_card(
 
 @contextmanager
 def own_textures(objects: Sequence[GridField]) -> Iterator[None]:
-    """Give objects their own textures back at the end."""
+    """Give objects their original textures back at the end."""
     own = [item.texture.numpy().copy() for item in objects]
     try:
         yield
@@ -301,16 +302,16 @@ def place_objects(
     surroundings: Surroundings | None,
     settings: EvaluateSettings,
 ) -> list[PosedField]:
-    """Give some objects random textures, and put them beside the road.
+    """Give some objects random textures, and put them at the roadside.
 
     Args:
         period: seconds between two images.
-        route: that is driven.
+        route: of the drive.
         count: how many objects.
         run: number of the drive; other runs begin with other objects.
         objects: all that there are; they get the textures.
-        surroundings: theirs; None without objects.
-        settings: see there.
+        surroundings: of the objects; None without objects.
+        settings: of the evaluation.
 
     Raises:
         InputError: the objects are too few, or do not find a place.

@@ -125,9 +125,9 @@ def compare_with_scene(
 ) -> Comparison:
     """Compare a field with a Mitsuba scene from where a vehicle looks.
 
-    The field's frames are those that an attack sees: one ray through the centre of
-    each pixel. The scene's are path-traced, filtered over the pixel, each from two
-    halves of the samples whose difference tells the noise.
+    The field's frames are the frames that an attack renders: one ray through the centre
+    of each pixel. The scene's frames are path-traced and filtered over the pixel. The
+    samples of each frame form two halves, whose difference measures the noise.
 
     Args:
         surrogate: field in the world's frame, metres.

@@ -46,15 +46,15 @@ def identify(
     settings: EvaluateSettings,
     vehicle: AbstractVehicleSection | None = None,
 ) -> dict[tuple[str, str], dict[str, str]]:
-    """Describe all that decides about the drives of each environment and route.
+    """Describe everything that the drives of each environment and route depend on.
 
     Args:
-        policy: as of `EvaluateDrives`, and so are the others.
-        place: likewise.
-        environments: likewise.
-        routes: likewise.
-        settings: the numbers of runs and objects do not count.
-        vehicle: likewise.
+        policy: section of the policy that drives.
+        place: where it drives.
+        environments: with their conditions.
+        routes: that are driven, with different names.
+        settings: all but the numbers of runs and objects count.
+        vehicle: section of the car; None for the car of the place.
 
     Returns:
         by label of the environment and name of the route.

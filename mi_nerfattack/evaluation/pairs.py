@@ -30,18 +30,19 @@ class Effect:
 
     Attributes:
         attacks: that were compared, n of all intervals.
-        drives: pairs of drives whose means they are; several of one start and side,
-            such as random looks, count as one.
+        drives: pairs of drives whose means they are; several drives of one start and
+            side, such as those with random textures, count as one.
         unpaired: starts of either side without a partner, which were left out.
-        seeds: fewest of a scenario.
+        seeds: least number of seeds of a scenario.
         one: mean of one side over the attacks.
-        other: of the other one.
+        other: mean of the other side over the attacks.
         difference: mean of one side less the other.
         difference_ci95: over the attacks, see `summary.interval`; None for few.
         iqm: interquartile mean of the differences.
-        iqm_ci95: likewise; None also where too few differences differ.
-        ratio: of the means; None where one of the other side's is 0 or less.
-        ratio_ci95: likewise; None without a ratio or for few attacks.
+        iqm_ci95: over the attacks; None for few attacks, and where too few differences
+            differ.
+        ratio: of the means; None where a value of the other side is 0 or less.
+        ratio_ci95: over the attacks; None for few attacks, and without a ratio.
         spread: standard deviation of the difference from seed to seed, pooled over the
             scenarios; None where none has two seeds.
     """
@@ -66,14 +67,14 @@ class Departures:
     """How many attacks depart on either side.
 
     Attributes:
-        both: attacks that do on both.
-        one: on this side alone.
-        other: on the other one alone.
-        neither: on none.
-        one_ci95: of the share on this side (Wilson); None for few attacks.
-        other_ci95: on the other one.
-        p_value: of a split of those on one side alone as uneven as this, were the
-            sides equal (McNemar's exact test, two-sided); None where there are none.
+        both: number of attacks that depart on both sides.
+        one: number of attacks that depart on one side alone.
+        other: number of attacks that depart on the other side alone.
+        neither: number of attacks that depart on no side.
+        one_ci95: of the share on one side (Wilson); None for few attacks.
+        other_ci95: of the share on the other side.
+        p_value: chance of a split between `one` and `other` as uneven as this, were
+            the sides equal (McNemar's exact test, two-sided); None where both are 0.
     """
 
     both: int

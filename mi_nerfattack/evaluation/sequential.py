@@ -160,9 +160,9 @@ class Criteria(Section):
 def rate_interval(successes: int, drives: int) -> list[float]:
     """Return a 95 % interval of a rate that holds whenever one stops to drive.
 
-    Rates at which the likelihood, averaged over all rates, is less than 20 times as
-    large as it is there: at the true rate that ratio is a martingale, which exceeds 20
-    at any time with a probability of 5 % at most.
+    The interval holds the rates at which the likelihood is more than a twentieth of its
+    average over all rates. At the true rate, average over likelihood is a martingale.
+    So it ever exceeds 20 with a probability of 5 % at most.
 
     Args:
         successes: among the drives.

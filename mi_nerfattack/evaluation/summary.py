@@ -159,8 +159,9 @@ def summary(
 ) -> pd.DataFrame:
     """Summarise drives by columns, with one row per group, in the order of the table.
 
-    What `once` tells apart, an attack, counts once: its drives are averaged first,
-    because starts say nothing about other attacks. Columns of the result:
+    The columns of `once` name one attack. An attack counts once: its drives are
+    averaged first, because its starts say nothing about other attacks. Columns of the
+    result:
 
     - `attacks`, `drives`: how many;
     - `cross_track_mean_m`, `cross_track_sd_m`, `cross_track_mean_ci95_m`: mean error

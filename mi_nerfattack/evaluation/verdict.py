@@ -238,12 +238,12 @@ Curve = Mapping[str, Sequence[float]]
 def run_flags(
     document: Figures, without_gradient: Sequence[str], by_gradient: bool
 ) -> Iterator[str]:
-    """Tell what one run says against itself.
+    """Give reasons to doubt a run, from its own figures.
 
     Args:
         document: as of `metrics.metrics_document`, with all that follows.
         without_gradient: objects whose texture and pose the objective does not depend
-            on, as far as the attack's gradient tells.
+            on, according to the attack's gradient.
         by_gradient: whether the attack has one.
     """
     if names := ", ".join(without_gradient):
@@ -308,11 +308,11 @@ def black_box_better(gradient: Curve, others: Mapping[str, Curve]) -> Iterator[s
 
 
 def noise_larger(effect: Effect, figure: str) -> Iterator[str]:
-    """Tell of an effect that differs more from seed to seed than it is large.
+    """Warn of an effect that differs more from seed to seed than it is large.
 
     Args:
-        effect: of several seeds; of one, nothing is told.
-        figure: what it is of, in words.
+        effect: of several seeds; an effect of one seed gives no warning.
+        figure: name of the compared figure, in words.
     """
     if effect.spread is not None and abs(effect.difference) < effect.spread:
         yield _noise_told(figure, effect.difference, effect.spread, "seed to seed")

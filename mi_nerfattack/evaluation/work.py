@@ -266,9 +266,9 @@ def run_evaluation(
         progress: called with control periods done and wanted.
 
     Raises:
-        InputError: before the first drive, a lane narrower than the car, objects
-            that find no place, an environment that cannot be made, several processes
-            for CARLA, or a damaged drive in the folder; later, a policy that does not
+        InputError: before the first drive, a lane is narrower than the car, or objects
+            find no place. An environment cannot be made, CARLA is given several
+            processes, or a drive in the folder is damaged. Later, the policy does not
             take the images.
     """
     limits = departure_limits(work.routes, work.settings.car_width_m)

@@ -26,13 +26,14 @@ from mi_nerfattack.rollout.sweep import StepRecorder
 def control_changes(drives: Sequence[Drive], unit: str, seed: int) -> dict[str, Any]:
     """Return figures by environment and case, for ``metrics.json``.
 
-    ``control_change_mean`` and ``control_change_max`` are of the distance from the
-    control with own textures in the same frame, over all frames and runs; the interval
-    of the mean is over runs, null of few; see `summary.interval`. Of several controls
-    they are of the first one, which steers.
+    ``control_change_mean`` and ``control_change_max`` are the mean and the largest
+    change of the control over all frames and runs. The change compares with the control
+    for the original textures in the same frame. The interval of the mean is over runs,
+    null for few runs; see `summary.interval`. Of several controls the figures are of
+    the first one, which steers.
 
     Args:
-        drives: of recorded drives; of each environment one past own textures.
+        drives: of recorded drives; each environment has one drive of the case `own`.
         unit: of the control.
         seed: of the bootstrap.
     """

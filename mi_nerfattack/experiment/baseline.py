@@ -1,4 +1,4 @@
-"""Random looks of an attack's cost, and the best of them."""
+"""Random appearances with an attack's budget, and the best of them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,8 @@ class RandomAppearances:
 
     Attributes:
         looks: draws.
-        own: the objects' own look; what an attack may not change stays like that.
+        own: the original appearance of the objects; parts that the attack may not
+            change keep it.
     """
 
     looks: RandomLooks
@@ -51,13 +52,13 @@ class RandomAppearances:
 
     @classmethod
     def of(cls, world: World, own: Appearance) -> RandomAppearances:
-        """Make the random looks of a scenario."""
+        """Make the random appearances of a scenario."""
         scenario = world.scenario
         freedom, kind = scenario.attack.freedom.build(), scenario.baseline.kind
         return cls(RandomLooks(world.fields, freedom, kind, scenario.seed), own)
 
     def __call__(self, number: int) -> Appearance:
-        """Return a look."""
+        """Return an appearance by its number."""
         textures, offsets = self.looks.textures(number), self.looks.offsets(number)
         return Appearance(
             self.own.textures if textures is None else textures,
@@ -66,7 +67,7 @@ class RandomAppearances:
 
 
 class Judged(Record):
-    """What the judgement of a look gave.
+    """What the judgement of an appearance gave.
 
     Attributes:
         objective: the attack's.
@@ -78,10 +79,10 @@ class Judged(Record):
 
 
 class Judge:
-    """What a process needs to judge looks.
+    """What a process needs to judge random appearances.
 
-    Each is judged as the attack judges its own, from the poses that it starts from:
-    by one drive, so that as many as :func:`equal_count` cost what the attack does.
+    Each appearance is judged with the attack's objective and starting poses, by one
+    drive. So :func:`equal_count` appearances cost as much as the attack.
     """
 
     def __init__(self, world: World, attack: AbstractAttack, own: Appearance) -> None:
@@ -89,7 +90,7 @@ class Judge:
         self._looks = RandomAppearances.of(world, own)
 
     def judge(self, number: int, on_step: OnStep) -> Judged:
-        """Judge a look."""
+        """Judge an appearance."""
         world, attack, before = self._world, self._attack, self._world.renders
         world.show(self._looks(number))
         with deterministic(world.scenario.attack.deterministic):
@@ -99,13 +100,13 @@ class Judge:
 
 @dataclass(frozen=True, eq=False)
 class Judgements(AbstractWork):
-    """Judgements of random looks, a file each.
+    """Judgements of random appearances, one file each.
 
     Args:
         folder: of the files.
         identity: of the run.
         scenario: of the run.
-        here: judges in this process; another process builds its own.
+        here: the judge of this process; another process builds a judge.
     """
 
     folder: Path
@@ -121,7 +122,7 @@ class Judgements(AbstractWork):
         return Judge(world, build_attack(world), world.appearance())
 
     def do(self, opened: Judge, index: int, report: OnUnits) -> None:
-        """Judge one look; a unit is a control period."""
+        """Judge one appearance; a unit is a control period."""
         with one_thread():
             found = opened.judge(index, lambda step: report(1))
         files.make_folder(self.folder)
@@ -132,12 +133,12 @@ class Judgements(AbstractWork):
         del opened
 
     def read(self, number: int) -> Judged | None:
-        """Read the judgement of a look; None where there is none."""
+        """Read the judgement of an appearance; None where there is none."""
         kept = self._unit(number).read()
         return None if kept is None else kept.record
 
     def remove_others(self, count: int) -> None:
-        """Remove what is left of other runs in the folder, and further looks."""
+        """Remove files of other runs in the folder, and of further appearances."""
         wanted = {self._unit(number).path for number in range(count)}
         for path in self.folder.glob("*.safetensors"):
             if path not in wanted:
@@ -155,15 +156,15 @@ class Judgements(AbstractWork):
 
 @dataclass
 class Baseline:
-    """Random looks that cost together what an attack does, and what became of both.
+    """Random appearances that together cost as much as an attack, and both results.
 
     Attributes:
         attack: finished.
         looks: draws.
-        count: of looks.
-        deployed: of them, driven with in each deployment.
+        count: number of random appearances.
+        deployed: number of them that drive in each deployment.
         backward_multiple: cost of the attack's backward pass, in drives.
-        objectives: of the looks, once they are judged.
+        objectives: of the random appearances, once they are judged.
     """
 
     attack: AbstractAttack
@@ -185,11 +186,11 @@ class Baseline:
 
         Args:
             world: what the scenario describes.
-            original: how its objects look and stand by themselves.
+            original: the original appearance of its objects.
             attack: finished.
-            effort: tells the cost of a backward pass; in a deterministic run, where no
-                clock may decide anything, it counts as one drive, and of a search,
-                which makes none, as nothing.
+            effort: its times give the cost of a backward pass. In a deterministic run,
+                where no clock may decide anything, a backward pass costs one drive. A
+                search has no backward pass, and it costs nothing.
         """
         section, strict = world.scenario.baseline, world.scenario.attack.deterministic
         is_timed = attack.sweeps > 1 and not strict
@@ -207,11 +208,11 @@ class Baseline:
         progress: OnSteps,
         on_judged: Callable[[int], None],
     ) -> None:
-        """Judge all looks, and find the best.
+        """Judge all random appearances, and find the best.
 
         Args:
             work: their judgements.
-            workers: who does those that are missing.
+            workers: processes for the missing judgements.
             progress: called with control periods done and wanted.
             on_judged: called with the frames of each judgement.
 
@@ -238,11 +239,11 @@ class Baseline:
 
     @property
     def best(self) -> int:
-        """Number of the look with the least objective: the worst for the policy."""
+        """Number of the appearance with the least objective, the worst one to drive."""
         return int(np.argmin(self.objectives))
 
     def figures(self) -> dict[str, Any]:
-        """Return what ``metrics.json`` tells of it."""
+        """Return what ``metrics.json`` holds of the baseline."""
         return {
             "textures": self.count,
             "deployment_textures": self.deployed,

@@ -72,13 +72,15 @@ def decisive(
 def step_counter(
     on_progress: OnProgress, stage: str, total: int, done: int = 0
 ) -> OnStep:
-    """Return what reports the progress of sweeps through a drive, step by step.
+    """Return a function that reports the progress of sweeps through a drive.
+
+    It takes the index of a control period and counts one step.
 
     Args:
-        on_progress: told.
-        stage: what it is told.
+        on_progress: called with stage, steps done, all steps and an empty remark.
+        stage: name of the stage, for `on_progress`.
         total: steps of all sweeps.
-        done: of them, before.
+        done: steps that were done before.
     """
     count = tally(lambda now, most: on_progress(stage, now, most, ""), done, total)
     return lambda step: count(1)
@@ -90,9 +92,9 @@ class Shown:
 
     Attributes:
         start: (3,) pose.
-        look: appearance of all objects, or of what the driver makes one; None without
-            objects.
-        digest: of the look.
+        look: appearance of all objects, or a value that the driver turns into an
+            appearance; None without objects.
+        digest: of the appearance.
     """
 
     start: np.ndarray
@@ -105,7 +107,7 @@ class CaseDriver(AbstractDriver):
 
     Args:
         world: to drive in.
-        looks: makes an appearance of a look that is none.
+        looks: turns a `look` that is no appearance into one.
     """
 
     def __init__(self, world: World, looks: Callable[[Any], Appearance]) -> None:
@@ -176,9 +178,10 @@ class Cases:
         world: fields, environments, policy.
         store: of finished drives.
         identity: of the scenario, see :meth:`Scenario.identity`.
-        on_progress: told about every control period.
+        on_progress: called after every control period with stage, steps done, all
+            steps and a remark.
         on_drives: called whenever drives were done.
-        own: how the objects look by themselves.
+        own: the original appearance of the objects.
         looks: by case, what all its drives show; None for no objects.
         renders: frames that the world's sensors did not render.
     """
@@ -208,7 +211,7 @@ class Cases:
         return [self._spec(label, case, run, self.looks[case]) for run in range(count)]
 
     def of_random(self, label: str, count: int) -> list[DriveSpec]:
-        """Describe drives past random looks, each from one of the initial states."""
+        """Describe drives with random textures, each from one of the initial states."""
         return [self._spec(label, RANDOM, run, run) for run in range(count)]
 
     def one(self, label: str, case: str, run: int) -> Drive:

@@ -33,12 +33,12 @@ class Finished:
     """What a run came to.
 
     Attributes:
-        world: what was driven in; its textures are changed by what looks at it.
+        world: of all drives; functions that show a case change its textures.
         drives: all drives.
         attack: the finished attack.
-        looks: how the objects look and where they stand, per case; None: nowhere.
+        looks: by case, the appearance and place of the objects; None: no objects.
         ignored: changes between interruption and resumption that were ignored.
-        baseline: figures of the random looks.
+        baseline: figures of the random textures.
         flags: findings of the checks before the attack.
     """
 
@@ -58,7 +58,7 @@ class Finished:
 
     @property
     def history(self) -> list[dict[str, Any]]:
-        """A row an iteration, for ``attack.json``.
+        """Rows for ``attack.json``, one per iteration.
 
         Without gains where changes were ignored, as :attr:`curve`.
         """

@@ -76,11 +76,11 @@ class Job:
         text: the scenario file, kept in the run folder.
         policy: the policy under test.
         output: the run folder.
-        on_progress: told about every time step.
-        on_notice: told what a run that goes on ignores.
+        on_progress: called after every time step with stage, steps and a remark.
+        on_notice: called with a sentence, such as what a continued run ignores.
         started: `time.perf_counter()` from which the wall time counts.
         frames: of each case, see ``pictures.frames.frame_steps``; None writes no
-            pictures at all: no frames, plots, attribution and page.
+            frames, plots, attribution and page.
         shared: folder of drives that other runs have in common with this one, if any.
         workers: who does the drives.
     """
@@ -368,7 +368,8 @@ def attack_claimed(
         object_field: grid field that replaces the one of every object.
         started: `time.perf_counter()` from which the wall time counts.
         frames: as of :func:`attack_policy`.
-        workers: likewise; None for one a core, 1 for what one server answers.
+        workers: as of :func:`attack_policy`; None for one per core, 1 for a policy or
+            an environment behind one server.
         settings: as of :func:`attack_policy`.
         on_progress: called with stage, steps done, steps in all and a remark.
         on_notice: called with a sentence.

@@ -83,10 +83,10 @@ def write_results(
 
     Args:
         output: the run folder, present.
-        done: what the run came to.
-        effort: tells what the run has cost so far.
-        on_progress: told about every time step of attribution and frames.
-        on_notice: told what is safe when pictures fail.
+        done: results of the run.
+        effort: returns the cost of the run so far.
+        on_progress: called after every time step of attribution and frames.
+        on_notice: called with a sentence that names the safe files if pictures fail.
         frames: of which frames, plots, attribution and page are written, too; None
             leaves all of them out.
 

@@ -32,9 +32,9 @@ REMEDY = (
 
 
 class CheckpointRecord(Record):
-    """What is kept beside the state.
+    """Record of a checkpoint, without the state of the attack.
 
-    Differences that were ignored, findings of the checks before.
+    It holds ignored differences and the findings of the checks before the attack.
     """
 
     ignored: list[str]
@@ -162,9 +162,10 @@ class Effort(Record):
         renders: frames.
         checkpoint_s: seconds spent on writing checkpoints.
         processes: how many have worked on the run.
-        forward_s: seconds of the attack's drives; the first of each process, which
-            compiles, is left out.
-        backward_s: seconds of the passes back through them, likewise.
+        forward_s: seconds of the attack's drives; the first drive of each process,
+            which compiles, is left out.
+        backward_s: seconds of their backward passes; the first pass of each process is
+            left out.
     """
 
     wall_s: float = 0.0
@@ -177,7 +178,7 @@ class Effort(Record):
 
     @property
     def backward_multiple(self) -> float:
-        """Cost of a pass back, in drives; 1 where none was measured."""
+        """Cost of a backward pass, in drives; 1 where none was measured."""
         return self.backward_s / self.forward_s if self.forward_s else 1.0
 
 
@@ -261,9 +262,9 @@ def folder_labels(folders: Sequence[Path]) -> list[str]:
 class RunFolder:
     """A folder that this process has claimed, see :func:`claim.claimed`.
 
-    Its files appear in this order: ``scenario.toml``, ``effort.safetensors``, which
-    tells whose folder it is, ``drives/`` with a file a drive and, among them,
-    ``checkpoint.safetensors``, results. A process may be killed between any two.
+    Its files appear in this order: ``scenario.toml``; ``effort.safetensors``, which
+    identifies the run; ``drives/`` with one file per drive; among them
+    ``checkpoint.safetensors``; the results. A process may be killed between any two.
 
     Args:
         path: the folder.
@@ -290,13 +291,13 @@ class RunFolder:
     def read(self, force: bool, on_notice: Callable[[str], None]) -> None:
         """Take up what a run left; nothing is written.
 
-        A folder that holds nothing but what a writer that was killed left is that of
-        a run that came to nothing: it starts from the beginning.
+        A killed writer may leave a folder with nothing but the beginning of its files.
+        Such a folder counts as new, and its run starts from the beginning.
 
         Args:
-            force: ignore that the run was of another scenario or other versions: its
-                attack goes on; drives that are other ones now are repeated.
-            on_notice: told about what is taken up and ignored.
+            force: ignore that the run was of another scenario or other versions. Its
+                attack continues, and drives that have changed are repeated.
+            on_notice: called with a sentence for each difference that is ignored.
 
         Raises:
             InputError: a file is damaged, or the run was of another scenario or other

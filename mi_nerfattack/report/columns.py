@@ -26,18 +26,19 @@ class Cell(NamedTuple):
 
 @dataclass(frozen=True)
 class Column:
-    """A column: what it is called and what it shows of a record.
+    """A column of a table: its name, and the value that it shows of a record.
 
     A value is a text, a number, the two ends of an interval, or None.
 
     Attributes:
         header: name.
         value: keys of the value in a record, such as ``attack.wheel_out_s``, or a
-            function of the record; three keys: a count, a total, and the ends of an
-            interval of the share. Or a format, such as ``{psnr_db:.2f}``: None gives
-            no text, an undefined number a dash, a pair "a to b", and the type ``%`` a
-            number of percent without the sign; `bad` of the record has the headers of
-            columns in which the record is not good enough.
+            function of the record. Three keys are a count, a total, and the ends of an
+            interval of the share. A text with braces is a format, such as
+            ``{psnr_db:.2f}``. In a format None gives no text, an undefined number a
+            dash, and a pair "a to b". The type ``%`` gives a number of percent without
+            the sign. `bad` of the record has the headers of columns in which the record
+            is not good enough.
         digits: of numbers, after the point.
         short: name in a terminal; the header by default.
         page: whether a page shows it.

@@ -145,7 +145,7 @@ def _out(where: str) -> Column:
 
 
 def headline_table(runs: Sequence[RunPart]) -> Table:
-    """Return runs beside each other: a row for each route and environment."""
+    """Compare runs in a table with one row per run, route and environment."""
     figures = [
         *(_NO_OBJECT, _RANDOM, Column("95 %", "random.cross_track_mean_ci95_m")),
         *(_ATTACK, Column("times random", _times_random, 1)),
@@ -307,7 +307,7 @@ def sweep_table(document: Document) -> Table:
 
 
 def comparisons_table(document: Document) -> Table:
-    """Return attacks beside other drives of the same places, seeds and starts."""
+    """Compare attacks with other drives of the same places, seeds and starts."""
     figures = [
         Column("n", "effect.attacks"),
         Column("ratio", "effect.ratio", 2),

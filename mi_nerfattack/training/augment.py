@@ -23,7 +23,8 @@ class Augmentation:
             from [-e, e]; linear light.
         gain: largest factor on the light of single channels, drawn from [1/g, g],
             log-uniform.
-        contrast: largest factor on the distance from mid-grey (sRGB), drawn likewise.
+        contrast: largest factor on the distance from mid-grey (sRGB), drawn from
+            [1/c, c], log-uniform.
         blur: largest weight of the image's 3x3 box blur, drawn from [0, blur].
         noise: largest standard deviation of Gaussian noise on each value (sRGB,
             full scale 1), drawn from [0, noise].

@@ -54,18 +54,18 @@ def collect(
 ) -> list[Path]:
     """Render what vehicles near the routes see, and label it by the expert.
 
-    Shards that are complete are kept; each has random numbers of its own. So the
-    frames depend neither on the number of workers nor on interruptions, however hard.
+    Complete shards are kept, and each shard has another seed. So the frames depend
+    neither on the number of workers nor on interruptions, for example by a power cut.
 
     Args:
         site: makes the environments, and gives objects and their surroundings.
         routes: that `staging` may choose.
         source: of the states.
-        settings: see there.
+        settings: of the collection.
         folder: gets `<site.name>/shard_0000.safetensors` and so on.
         workers: who renders.
         progress: called now and then; an exception from it stops the work.
-        staging: what stands beside which stretch; random objects by default.
+        staging: what is at the roadside of each stretch; random objects by default.
 
     Returns:
         The shards, in order.

@@ -69,10 +69,10 @@ def imitate(
     Everything slow is kept in the folder: the same call continues where it stopped.
 
     Args:
-        sites: with different names; those of `settings`.
-        routes: to drive; the policy has goals from 0 to their largest, or as many as
-            the first weights.
-        settings: see there.
+        sites: with different names; the sites of `settings`.
+        routes: to drive; the policy has goals from 0 to their largest goal, or as many
+            as the first weights.
+        settings: of collections, training and validation.
         folder: of frames and checkpoints.
         workers: who collects.
         progress: called often; an exception from it stops the work.
@@ -81,10 +81,10 @@ def imitate(
         staging: of all collections, see `collect`.
 
     Raises:
-        InputError: before the first frame, no frames wanted, an unknown site, one
-            that cannot be opened, a camera, a route, first weights or frames of `more`
-            that do not fit, objects without a place, or another process that works in
-            the folder; then, where the folder holds what was made with other settings.
+        InputError: before the first frame, no frames are wanted, or another process
+            works in the folder. A site is unknown or cannot be opened, or objects find
+            no place. A camera, a route, first weights or frames of `more` do not fit.
+            Later, the folder holds results of other settings.
     """
     _check_wanted(sites, routes, settings, more)
     _check_policy(sites, routes, settings, more)

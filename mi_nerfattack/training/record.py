@@ -1,4 +1,4 @@
-"""What a training writes down about itself, beside the policy."""
+"""The record of a training, which is written next to the policy."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mi_nerfattack.training.validation import Epoch
 
 
 class TrainingRecord(Record):
-    """How a policy was trained, and how it drove; the JSON beside it.
+    """How a policy was trained, and how it drove: the JSON file next to the policy.
 
     Attributes:
         environments: of the last validation, {ENVIRONMENT: {ROUTE: {CASE: figures}}}.
@@ -31,7 +31,7 @@ class TrainingRecord(Record):
         best_round: whose weights the policy has.
         command: that was given.
         seed: of the training.
-        settings: `ImitationSettings`, without those that others override.
+        settings: `ImitationSettings`, without settings that others override.
         augmentation: of the images.
         data: frames by collection.
         sites: where the frames come from.
@@ -89,7 +89,7 @@ def training_record(
 def write_trained(
     path: Path, module: PilotNet, record: TrainingRecord
 ) -> dict[str, Any]:
-    """Write a policy, and beside it its program and its record; return the latter.
+    """Write a policy and, next to it, its program and its record; return the record.
 
     Args:
         path: of the weights (.safetensors).
@@ -104,7 +104,7 @@ def write_trained(
 
 
 def read_record(path: Path) -> TrainingRecord | None:
-    """Read what training writes beside a policy; None for JSON of something else.
+    """Read the record next to a policy; None for JSON of something else.
 
     Raises:
         InputError: unreadable, or no JSON.

@@ -95,7 +95,7 @@ class Scenery:
     def strayed(self) -> bool:
         """Whether the vehicle is so far off that its frames teach nothing.
 
-        More than 0.6 lane widths beside the route, or more than 2 m past its end.
+        More than 0.6 lane widths off the route, or more than 2 m after its end.
         """
         arc, error, _ = self.route.project_numpy(self.environment.state[:3])
         past = not self.route.closed and arc[0] > self.route.length + 2

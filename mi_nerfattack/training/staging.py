@@ -1,4 +1,4 @@
-"""Where driving frames are taken, and what stands beside the road there."""
+"""Where driving frames are taken, and what is at the roadside there."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class AbstractStaging(ABC):
 
     @abstractmethod
     def identity(self) -> dict[str, str]:
-        """Return what decides about the frames beside site, routes and settings."""
+        """Return what the frames depend on besides site, routes and settings."""
 
     @abstractmethod
     def open(

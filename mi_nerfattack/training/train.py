@@ -84,9 +84,9 @@ def fit_policy(
 ) -> list[Epoch]:
     """Train a policy and leave the weights of its best epoch in it.
 
-    Best is the epoch with the fewest drives departed in the closed loop, among these
-    that of the least mean error to a millimetre, among these that of the least held-out
-    loss. Without a validation in the closed loop the loss alone decides.
+    The best epoch has the fewest departed drives in the closed loop. Of several such
+    epochs, the least mean error decides, to a millimetre, and then the least held-out
+    loss. Without a validation in the closed loop, the loss alone decides.
 
     The loss is the mean squared difference of control divided by the largest
     control. With a checkpoint, each epoch ends by writing it atomically, and a run
@@ -95,11 +95,11 @@ def fit_policy(
     Args:
         module: changed in place; ends on the CPU in evaluation mode.
         data: frames, goals, expert controls (rad/s).
-        settings: see there.
+        settings: of the training.
         checkpoint: safetensors file of the whole state, or None.
         device: torch device of the computation.
         progress: called after each step; an exception from it ends the training.
-        held_out: frames of another collection for the loss, in place of a part of
+        held_out: frames of another collection for the loss, instead of a part of
             `data`.
         validation: in the closed loop; None for none.
 
@@ -145,7 +145,7 @@ class Part:
         return cls(data, np.arange(len(data)))
 
     def describe(self) -> list[Any]:
-        """Return what tells parts apart: number of rows, checksum of the data."""
+        """Return the number of rows and the checksum of the data."""
         return [len(self.rows), self.data.digest]
 
 

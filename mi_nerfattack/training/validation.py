@@ -45,7 +45,7 @@ class Epoch(Measured):
 
 
 class AbstractValidation(ABC):
-    """Measurement of a policy beside its loss.
+    """Measurement of a policy besides its loss.
 
     Attributes:
         every: epochs from one measurement to the next; the last is always measured.
@@ -86,13 +86,13 @@ class LossAlone(AbstractValidation):
 class ClosedLoop(AbstractValidation):
     """Lets the policy drive every route in some environments, from random starts.
 
-    Starts, places and textures are those of the settings' seed, the same each time.
+    The seed of the settings decides starts, places and textures, the same each time.
 
     Args:
         environments: with different names.
         routes: to drive.
-        objects: stand beside the road; may be empty.
-        surroundings: of the objects; None without.
+        objects: fields of the roadside objects; may be empty.
+        surroundings: of the objects; None without objects.
         settings: number of drives, starts, cases.
         every: epochs from one measurement to the next.
         progress: called with steps done and wanted.

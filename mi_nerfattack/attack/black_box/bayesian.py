@@ -20,14 +20,14 @@ _RANDOM_FIRST = 10
 
 
 class BayesianSearch(AbstractSearch):
-    """Fits a Gaussian process to what was told, and asks where it expects a gain.
+    """Fits a Gaussian process to all objectives, and asks where it expects a gain.
 
     Args:
         basis: of the textures, at most 64 coefficients.
         seed: of all draws.
 
     Raises:
-        InputError: more coefficients.
+        InputError: the basis has more coefficients.
         SetupError: Optuna is not installed.
 
     Source: Hvarfner et al., ICML 2024 (dimension-scaled priors); Optuna's `GPSampler`.

@@ -82,11 +82,11 @@ class RandomSearch(AbstractSearch):
 
 
 def equal_count(iterations: float, backward_multiple: float) -> int:
-    """Return how many drives cost what the iterations of an attack do.
+    """Return the number of drives that cost as much as an attack's iterations.
 
     Args:
-        iterations: each one drive and one pass back through it.
-        backward_multiple: cost of the pass back, in drives.
+        iterations: each has one drive and one backward pass through it.
+        backward_multiple: cost of the backward pass, in drives.
     """
     return max(1, round(iterations * (1 + backward_multiple)))
 

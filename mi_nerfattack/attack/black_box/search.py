@@ -38,10 +38,10 @@ def propose(colourings: Sequence[Colours], colours: Sequence[np.ndarray]) -> Pro
 
 
 class AbstractSearch(ABC):
-    """Proposes textures, one after the other, and is told what each gave.
+    """Proposes textures, one after the other, and takes the objective of each.
 
-    Proposals follow from the seed and what was told, and from nothing else: a search
-    that is made anew and told the same goes on as the first one would.
+    Proposals depend only on the seed and on the objectives so far. So a new search that
+    takes the same objectives continues exactly as the first search would.
     """
 
     @abstractmethod
@@ -131,10 +131,10 @@ class BlackBoxAttack:
         self.history.append(judged)
 
     def curve(self) -> np.ndarray:
-        """Return the best so far against the cost, a row a judgement.
+        """Return the best objective so far and its cost, one row per judgement.
 
         Returns:
-            (n, 3): see ``best_so_far``.
+            (n, 3): see :func:`best_so_far`.
         """
         frames = np.cumsum([judged.frames for judged in self.history])
         objectives = [judged.objective for judged in self.history]
@@ -147,10 +147,10 @@ class BlackBoxAttack:
         return {"history": rows.reshape(-1, len(fields(Judged)))}
 
     def load_tensors(self, tensors: dict[str, np.ndarray]) -> None:
-        """Tell a new search what another one of its kind and seed was told.
+        """Replay the history of another search of this kind and seed in a new search.
 
         Raises:
-            InputError: the rows are not those of a history.
+            InputError: the tensor does not have the shape of a history.
             KeyError: there is no history.
         """
         rows = tensors["history"]

@@ -122,7 +122,7 @@ class SurrogateSearch(AbstractAttack):
         self.history.append(IterationRecord(self.iteration, *numbers))
 
     def curve(self, backward_multiple: float) -> np.ndarray:
-        """See ``AbstractAttack.curve``; nothing passes back here."""
+        """See ``AbstractAttack.curve``; this attack has no backward pass."""
         del backward_multiple
         return self._attack.curve()
 

@@ -81,8 +81,8 @@ class AbstractColouring(ABC):
 class Colours(AbstractColouring):
     """Colours of one level's vertices.
 
-    Adam takes steps of one size everywhere, so that neighbours that hardly differ may
-    take opposite ones. Where the gradient is smoothed, they go together.
+    Adam takes steps of one size everywhere, so neighbours that hardly differ may take
+    opposite steps. Smoothing the gradient lets them go together.
 
     Args:
         field: of the object, with its original texture.
@@ -95,7 +95,7 @@ class Colours(AbstractColouring):
         extent: (3,), of the lattice along x, y, z of the object's own frame, metres.
 
     Raises:
-        InputError: no level is so coarse, or a fixed region lies beside the object.
+        InputError: no level is so coarse, or a fixed region misses the object.
     """
 
     def __init__(

@@ -89,7 +89,7 @@ class Allowed:
         original: (n, 3) sRGB, by vertex.
 
     Raises:
-        InputError: a fixed region beside the object.
+        InputError: a fixed region misses the object.
 
     Attributes:
         start: (n, 3) float32, the allowed colours nearest to the original.

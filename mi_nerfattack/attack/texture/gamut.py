@@ -54,9 +54,10 @@ class Gamut:
         """Read a gamut.
 
         Args:
-            path: an ICC profile (``.icc``, ``.icm``) of RGB or CMYK, sampled by its
-                relative colorimetric intent; else a text of sRGB colours, three
-                numbers a line, in 0 to 1 or, if any is larger, in 0 to 255.
+            path: an ICC profile (``.icc``, ``.icm``) of RGB or CMYK, or a text of sRGB
+                colours with three numbers per line. The profile is sampled by its
+                relative colorimetric intent. The numbers are in 0 to 1 or, if any is
+                larger, in 0 to 255.
 
         Raises:
             InputError: file missing, damaged or of another kind.

@@ -27,7 +27,7 @@ def do_cells(
     workers: AbstractWorkers,
     taken: Taken | None = None,
 ) -> Sweep:
-    """Do all cells that are not complete; returns what became of them.
+    """Do all cells that are not complete, and return the sweep with their results.
 
     Args:
         cells: of the sweep.
@@ -37,8 +37,8 @@ def do_cells(
         taken: cells that were done elsewhere, if any.
 
     Raises:
-        InputError: as of `Sweep.run`.
-        SetupError: likewise.
+        InputError: see `Sweep.run`.
+        SetupError: see `Sweep.run`.
     """
     from mi_nerfattack.commands.shared.progress import StageBars
     from mi_nerfattack.experiment.checks.cost import planned_periods

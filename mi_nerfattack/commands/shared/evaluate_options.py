@@ -28,7 +28,7 @@ class PlaceOptions:
     routes_file: Path | None = None
     """Routes (.json), or those of CARLA's leaderboard (.xml)."""
     object: tuple[Path, ...] = ()
-    """Grid fields beside the road; by default the place's."""
+    """Grid fields at the roadside; by default the place's."""
     server: str | None = None
     """CARLA's server and town, HOST:PORT/TOWN."""
 

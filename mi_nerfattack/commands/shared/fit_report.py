@@ -73,7 +73,7 @@ def finish(
     Args:
         result: of the fit.
         images: that were fitted to.
-        output: field file; the report lies beside it, see `report_folder`.
+        output: field file; the report is written next to it, see `report_folder`.
         provenance: source and settings, for the file's header.
         checkpoint: of the fit; removed when all is written.
     """

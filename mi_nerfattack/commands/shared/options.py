@@ -48,13 +48,13 @@ def _option(name: str) -> str:
 
 
 def command_line(name: str, options: Any) -> str:
-    """Write a command anew from what differs from its defaults.
+    """Write the command line of a command, without options at their defaults.
 
     Args:
         name: of the sub-command.
         options: the dataclass of its arguments; `policy` and `run_folders` are
-            positional. Of absolute paths, which tell about the machine alone, the last
-            part is written.
+            positional. Of an absolute path only the last part is written, because the
+            folders say nothing outside of this machine.
     """
     return " ".join(["mi-nerfattack", name, *_words(options)])
 

@@ -76,11 +76,12 @@ class StageBars:
         """Show how far a stage is, and how long it will take.
 
         Args:
-            stage: its name; the first call with a name adds a bar.
+            stage: name of the stage; the first call with a name adds a bar.
             done: units of work done.
             total: units of the whole stage.
-            state: what to write beside the bar.
-            kept: these units were there already, and tell nothing about the others.
+            state: text next to the bar.
+            kept: whether these units were done before, so that their time says nothing
+                about the other units.
         """
         if stage not in self._tasks:
             self._tasks[stage] = self._bars.add_task(stage, total=total, state=state)

@@ -45,7 +45,7 @@ DIFFERENCES, DIFFERENCES_TABLE = "differences", "differences.csv"
 
 
 class Measured(Record):
-    """What is kept beside the changes along a direction: nothing."""
+    """Record next to the changes along a direction; it holds nothing."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""What makes an attack worthless, told before it begins."""
+"""Checks that find, before an attack begins, why its result would be worthless."""
 
 from __future__ import annotations
 
@@ -115,19 +115,23 @@ _MESHES = ("mitsuba", "mujoco", "mujoco_gl")  # environments of the scene's mesh
 
 
 def first_findings(world: World, one: One) -> Iterator[str]:
-    """Check what one drive in each environment and the geometry tell.
+    """Check the geometry and one drive in each environment.
 
-    Scene and field lie beneath the route; the policy keeps its lane from the first
-    start in every environment, objects in their own textures; it comes to no end of
-    the route; every object is in view; objects stand beside the lane, on the ground,
-    in the open and apart.
+    The checks are:
+
+    - scene and field lie beneath the route;
+    - with original textures, the policy keeps its lane from the first start in every
+      environment;
+    - the policy does not reach the end of the route;
+    - every object is in view;
+    - the objects are next to the lane, on the ground, in the open and apart.
 
     Args:
-        world: objects look and stand as the scenario says.
-        one: makes the drives, or has them.
+        world: with textures and places of objects as the scenario says.
+        one: makes the drives, or reads finished drives.
 
     Yields:
-        a sentence each: what, where, and the remedy.
+        one sentence per finding: the problem, its place, and the remedy.
     """
     yield from route_findings(world)
     first = one(SURROGATE, OWN, 0)

@@ -56,9 +56,9 @@ class Check:
 
     Attributes:
         world: what the scenario describes; it stays as it was.
-        on_progress: told of a stage, units done, all units, and a remark.
-        refused: why `attack` would refuse the scenario, a sentence each.
-        doubts: what it would not refuse, and is seldom meant.
+        on_progress: called with a stage, units done, all units, and a remark.
+        refused: why `attack` would refuse the scenario, one sentence per reason.
+        doubts: settings that `attack` accepts but users seldom mean.
         cost: None where no attack could be tried.
         drives: that were made, unattacked.
         frames: the first of each environment.

@@ -28,14 +28,14 @@ class Cost:
 
     Attributes:
         iterations: at most.
-        random_looks: that it is compared with.
+        random_looks: number of random textures to compare the attack with.
         horizon: control periods of a drive.
-        frames: rendered, passes back included.
+        frames: rendered, with the frames of backward passes.
         wall_s: seconds, on this machine with the load that it has.
         memory_mb: at most.
         disk_mb: of the run folder.
-        period_s: seconds of a control period: of an iteration there, back, and of a
-            drive in each environment.
+        period_s: seconds per control period: of an iteration's ``forward`` and
+            ``backward`` pass, and of a drive in each environment by its label.
     """
 
     iterations: int
@@ -55,7 +55,7 @@ class Cost:
 def planned_periods(scenario: Scenario) -> int:
     """Return about how many control periods an attack and its drives have.
 
-    A pass back counts as a drive. It is known without a look at the scene.
+    A backward pass counts as a drive. The estimate does not load the scene.
 
     Raises:
         InputError: the route cannot be read.

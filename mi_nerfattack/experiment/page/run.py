@@ -65,8 +65,9 @@ def read_run(folder: Path, label: str, repeat: str | None = None) -> RunPart:
 
     Args:
         folder: of a finished run.
-        label: that tells it from others on the page.
-        repeat: the command that makes it again; that of its scenario by default.
+        label: name of the run on the page, different from other names.
+        repeat: the command that makes the run again; by default ``attack`` with its
+            scenario.
 
     Raises:
         InputError: it holds no finished run, or a file is damaged.

@@ -28,9 +28,9 @@ def read_sweep(
 
     Args:
         folder: of the sweep, or a copy of its table alone.
-        label: that tells it from others on the page.
+        label: name of the sweep on the page, different from other names.
         scratch: folder for plots that are made for the page.
-        on_run: told the label of each cell before its objects are rendered.
+        on_run: called with the label of each cell before its objects are rendered.
 
     Raises:
         InputError: the table or the folder of a cell is damaged.

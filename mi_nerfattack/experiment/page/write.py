@@ -1,4 +1,4 @@
-"""Read folders of results, told apart by their files, and write their page."""
+"""Read folders of results, whose files show their kind, and write their page."""
 
 from __future__ import annotations
 
@@ -46,7 +46,8 @@ def read_folders(
     Args:
         paths: folders, and files of retrainings.
         scratch: folder for plots that are made for the page.
-        on_run: told the label of each run before it is read, and its objects rendered.
+        on_run: called with the label of each run before the run is read and its
+            objects are rendered.
 
     Raises:
         InputError: none or one twice, one is of another kind or not finished, or a

@@ -75,7 +75,7 @@ class FrameFolder:
 
         Args:
             step: control periods before it.
-            time_s: seconds, likewise.
+            time_s: seconds before it.
             frame: as it was seen.
             layers: for the EXR file. Those that are called ``input.K`` and have a size
                 of their own go to ``STEP_input.exr``.
@@ -163,9 +163,9 @@ def write_frames(
 
     Args:
         output: the run folder.
-        done: what the run came to.
+        done: results of the run.
         frames: which frames become files.
-        on_progress: told about every time step.
+        on_progress: called after every time step with stage, steps and a remark.
     """
     world, nominal = done.world, nominal_drives(done.drives, done.looks)
     places, passed = aligned_steps(world.route, nominal, STRIP_FRAMES)

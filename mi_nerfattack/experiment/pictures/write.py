@@ -48,10 +48,10 @@ def write_images(
     Args:
         output: the run folder; what an earlier run left of attribution and videos is
             removed.
-        done: what the run came to; the objects look different afterwards.
-        history: a record an iteration of the attack.
+        done: results of the run; the objects have other textures afterwards.
+        history: one record per iteration of the attack.
         frames: which frames become files.
-        on_progress: told about every time step of attribution and frames.
+        on_progress: called after every time step of attribution and frames.
     """
     world, limit = done.world, done.lane.wheel_m
     for path in (*output.glob("attribution*"), *(output / "videos").glob("*.mp4")):

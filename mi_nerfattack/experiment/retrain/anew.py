@@ -1,4 +1,4 @@
-"""Attacks made anew on a retrained policy: what one that knows it still finds."""
+"""The same attacks again, on a retrained policy: what an attacker still finds."""
 
 from __future__ import annotations
 

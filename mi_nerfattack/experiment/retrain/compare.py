@@ -105,17 +105,18 @@ def read_with_policy(found: FoundAttack, policy: str) -> tuple[Scenario, str]:
 def table_rows(
     before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Set both stages side by side.
+    """Write both stages into one table.
 
     Args:
-        before: `transfer.json` by group.
-        after: likewise.
+        before: `transfer.json` by group, of the drives before the retraining.
+        after: `transfer.json` by group, of the drives after the retraining.
 
     Returns:
-        a row for each group and environment: figures by stage and case, as of the
-        columns of `transfer.json`; ``attack_to_clean``, by stage, the mean error past
-        attacks as a multiple of that without objects; ``clean_ratio``, the latter
-        after as a multiple of before.
+        one row per group and environment: figures by stage and case, as in the columns
+        of `transfer.json`, and two ratios of mean errors. ``attack_to_clean``, by
+        stage: the error with attacks as a multiple of the error without objects.
+        ``clean_ratio``: the error without objects after the retraining, as a multiple
+        of the error before.
     """
     rows = []
     for group, first in before.items():

@@ -1,4 +1,4 @@
-"""Policies that your own training writes, in place of the attacked one."""
+"""Policies that your own training writes, to replace the attacked policy."""
 
 from __future__ import annotations
 

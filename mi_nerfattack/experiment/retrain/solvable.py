@@ -1,4 +1,4 @@
-"""Scenarios that can be driven: by the expert, in its lane, past all objects."""
+"""Scenarios that the expert itself can drive: in its lane, clear of all objects."""
 
 from __future__ import annotations
 

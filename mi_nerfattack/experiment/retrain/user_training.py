@@ -259,8 +259,8 @@ def train_once(
 ) -> dict[str, Any]:
     """Train, unless the same training on the same frames was done.
 
-    Beside the file that it writes, `DONE` says what was done. The folder is left as it
-    is, so that a training may keep checkpoints there.
+    `DONE`, a file next to the written policy, records the training. Other files in the
+    folder stay, so a training may keep checkpoints there.
 
     Args:
         training: what to do.

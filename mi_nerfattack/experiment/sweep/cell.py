@@ -35,16 +35,16 @@ class Cell:
     """A row of the grid, with the whole scenario.
 
     Attributes:
-        route: name of the choice.
-        objects: likewise.
-        method: likewise.
+        route: name of the grid's choice of route.
+        objects: name of the grid's choice of objects.
+        method: name of the grid's choice of method.
         budget: rendered frames that the attack may cost; None: as the scenario says.
         seed: of the scenario.
         text: the scenario file, its paths absolute.
         digests: of the scenario and the files that it names.
         anyway: attack although the checks before find that it proves nothing.
         pictures: write frames, plots and page, too.
-        name: of the folder, where it is not that of route to digest.
+        name: of the folder, if it is not made from route to digest.
     """
 
     route: str

@@ -46,7 +46,7 @@ class Choice(AbstractChoice):
 
 
 class ObjectsChoice(AbstractChoice):
-    """Objects, which stand somewhere beside some routes."""
+    """Objects at the roadside of some routes."""
 
     routes: tuple[str, ...] | None = None  # by name; all
     draw: DrawSection | None = None  # in place of set.objects
@@ -70,7 +70,7 @@ class ObjectsChoice(AbstractChoice):
 
 
 class MethodChoice(AbstractChoice):
-    """A method, with what a pass back of its own costs."""
+    """A method, with the cost of its own backward pass."""
 
     backward_multiple: NonNegative | None = None  # in drives; by default the grid's
 

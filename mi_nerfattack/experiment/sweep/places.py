@@ -1,4 +1,4 @@
-"""Objects that the rule of training puts beside the routes of a grid."""
+"""Objects that the rule of training puts at the roadside of a grid's routes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _RULE = Roadside()
 
 
 class DrawSection(Section):
-    """Objects where such things stand, see `Roadside`, anew by each seed."""
+    """Objects at the roadside by the rule of `Roadside`, with one draw per seed."""
 
     fields: Annotated[tuple[File, ...], Field(min_length=1)]
     seeds: Annotated[tuple[Seed, ...], Field(min_length=1)] | None = None  # the cell's
@@ -60,12 +60,12 @@ class Places:
     def draw(
         self, section: DrawSection, seed: int, scenario: Scenario
     ) -> list[dict[str, Any]]:
-        """Draw where the objects stand beside the drive of a scenario.
+        """Draw places at the roadside for the objects of a scenario.
 
         Args:
             section: what is drawn.
-            seed: of the draw; each route has random numbers of its own.
-            scenario: its deployment scene, routes, drive, vehicle and camera count.
+            seed: of the draw; each route has different random numbers.
+            scenario: gives deployment scene, routes, drive, vehicle and camera.
 
         Returns:
             the keys of each object in a scenario.

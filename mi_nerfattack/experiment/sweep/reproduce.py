@@ -62,12 +62,13 @@ def read_replay(
             Relative paths of a cell begin in its parent, where the grid of a committed
             table is.
         names: rows: their index, from 0, or CELL:ENVIRONMENT:CASE:RUN.
-        count: of rows that are drawn besides.
-        seed: of that.
+        count: number of rows to draw at random, too.
+        seed: of the draw.
 
     Raises:
-        InputError: the table is missing or wrong; there is no such row, it tells of a
-            failure, or what it was made of is of other content here.
+        InputError: the table is missing or wrong, or there is no such row. The row is
+            of a cell that failed, or the files that its cell was made of have other
+            content here.
     """
     path = folder / RESULTS
     whole_table = read_table(path)
@@ -123,18 +124,19 @@ def compare_rows(
     """Say by how much repeated rows differ from the table's.
 
     Args:
-        replay: what was to be repeated.
+        replay: rows and cells to repeat.
         repeated: table of the repetition.
-        made: what its cells were made of.
+        made: programs and files that made the cells of `repeated`.
         errors: of cells that failed, by cell.
 
     Returns:
-        ``rows``: of each that was asked for its index, labels, `FIGURES` ``stored`` and
-        ``repeated``, and their absolute ``difference`` (null where there is no such
-        drive this time); ``cells``: of each, how many ``rows`` are compared, how many
-        are ``unmatched``, on either side, the ``largest_difference`` of all, what
-        ``versions`` differ (there, here), and its ``error``; ``largest_difference`` of
-        the rows that were asked for, null where none is there.
+        ``rows``: one per row of the replay, with index, labels, the `FIGURES`
+        ``stored`` and ``repeated``, and their absolute ``difference``. Figures are null
+        where there is no such drive this time. ``cells``: one per cell. ``rows`` counts
+        the compared rows, and ``unmatched`` the rows of one table alone. A cell also
+        has the ``largest_difference`` of its rows, the ``versions`` that differ (there,
+        here), and its ``error``. ``largest_difference``: of the ``rows``, null if no
+        row was repeated.
     """
     stored, again = (
         table[table["status"] == "complete"].set_index(_DRIVE)[FIGURES]

@@ -55,7 +55,7 @@ _OF_GROUP = (
 def write_summary(
     folder: Path, known: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
 ) -> dict[str, Any]:
-    """Summarise a sweep, and write ``summary.json`` beside its table.
+    """Summarise a sweep, and write ``summary.json`` next to its table.
 
     Args:
         folder: of the sweep.
@@ -96,18 +96,18 @@ def read_attacks(
     table: pd.DataFrame,
     known: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> list[dict[str, Any]]:
-    """Return what is told of each attack: by its cell's folder, or a summary.
+    """Read the attacks of a sweep, each from its cell's folder or from a summary.
 
     Args:
         folder: of the sweep.
         table: of the sweep.
-        known: attacks by cell, of :func:`told_attacks` elsewhere; those of cells
-            without a folder count, and before them those of the sweep's own summary.
+        known: attacks by cell, from :func:`told_attacks` of other folders. A cell's
+            own folder comes first, then the sweep's own summary, then `known`.
 
     Returns:
-        a row each, in the table's order: labels, `section` (`attack` of the
-        scenario; a folder alone tells it), `attack_method` (its own word),
-        `converged`, `flags` and `curve`.
+        one row per attack, in the table's order: labels, `attack_method`,
+        `converged`, `flags` and `curve`. Rows from a cell's folder also have `section`,
+        the section `attack` of the scenario.
 
     Raises:
         InputError: a file is damaged.
@@ -255,11 +255,11 @@ def _own_flags(attacks: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class Taken:
-    """What stands for cells that are not done again.
+    """Results of other sweeps, for cells that are not done again.
 
     Attributes:
         rows: of the table, of each complete cell.
-        made: what these cells were made of.
+        made: programs and files that made these cells.
         attacks: of the summary, by cell.
     """
 

@@ -90,11 +90,12 @@ class Sweep:
     Attributes:
         work: its cells.
         on_change: called when anything has happened.
-        taken: cells that were done elsewhere; one that is done here, too, is not used.
-        steps: control periods that cells have told of.
+        taken: cells that were done elsewhere; a cell that is done here replaces its
+            copy.
+        steps: control periods that the cells have reported.
         complete: cells that are done, by their index.
-        kept: how many were when this run began.
-        errors: why others failed when they were tried last.
+        kept: number of cells that were done when this run began.
+        errors: why other cells failed at their last attempt.
     """
 
     work: Cells

@@ -50,14 +50,14 @@ class Condition:
     Args:
         sky: time of day, key of `DAYLIGHT`.
         exposure_ev: of the camera, in powers of two.
-        noise_sd: of the camera, see `Conditions`.
-        blur_px: likewise.
+        noise_sd: standard deviation of the camera's noise, of sRGB values in [0, 1].
+        blur_px: standard deviation of the camera's Gaussian blur, pixels.
         dropped_share: of frames that are lost, see `DroppedFrames`.
-        late_periods: see `LateFrames`; what is lost is lost before it is late.
-        latency_periods: see `LateControls`.
-        placement_m: see `PoseError`, and so the next two.
-        turn_deg: likewise.
-        pitch_deg: likewise.
+        late_periods: delay of frames, see `LateFrames`; `dropped_share` acts before.
+        latency_periods: delay of controls, see `LateControls`.
+        placement_m: standard deviation of the objects' places, see `PoseError`.
+        turn_deg: standard deviation of the objects' turns, see `PoseError`.
+        pitch_deg: standard deviation of the camera's pitch, see `PoseError`.
     """
 
     sky: str = "day"

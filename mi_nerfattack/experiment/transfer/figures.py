@@ -121,7 +121,7 @@ def read_document(folder: Path) -> dict[str, Any]:
 
 
 def compare_rows(rows: Sequence[Row]) -> None:
-    """Set each row's attack beside the same in the surrogate without a condition.
+    """Compare each row's attack with the attack in the surrogate, without conditions.
 
     Args:
         rows: of ``transfer.json``; get ``ratio_to_surrogate``, ``succeeds`` and
@@ -244,10 +244,10 @@ def run_transfer(
 ) -> dict[str, Any]:
     """Do the drives that are not there yet, and summarise all.
 
-    ``transfer.json`` is written anew whenever a row is whole.
+    ``transfer.json`` is written again whenever a row is whole.
 
     Args:
-        work: all drives, those of `output`.
+        work: all drives; their store is in `output`.
         output: the folder, see `check_output`.
         workers: who does them.
         progress: called with control periods done and wanted.

@@ -47,11 +47,11 @@ class FoundAttack:
 
     Attributes:
         folder: of the run.
-        label: that tells it from the others.
+        label: name of the run, different from the names of other runs.
         scenario: of the run.
         route: that it drives along, with the vehicle's speed.
         offsets: (k, 6) of the attacked objects from where the scenario puts them.
-        best_random: number of the best of the run's random looks, None without any.
+        best_random: number of the best of the run's random textures, None without any.
         identity: of the scenario, see :meth:`Scenario.identity`.
         digest: of attacked textures and offsets.
         surrogate: in which it was found: ``file``, ``sha256``, ``psnr_heldout_db`` and

@@ -79,17 +79,17 @@ class FrameSource:
     def difference(
         self, drive: Drive, step: int, seen: np.ndarray, moved: Mapping[int, np.ndarray]
     ) -> np.ndarray | None:
-        """Show where a frame differs from that with objects in their own textures.
+        """Show where a frame differs from the frame with original textures.
 
         Args:
             drive: as of :meth:`see`.
-            step: likewise.
+            step: as of :meth:`see`.
             seen: what :meth:`see` returned.
-            moved: likewise.
+            moved: as of :meth:`see`.
 
         Returns:
             (height, width, 3), uint8, in the colours of heat maps; None for drives
-            without objects or past their own textures.
+            without objects or with original textures.
         """
         if drive.case in (NO_OBJECT, OWN):
             return None
@@ -123,7 +123,7 @@ def heat(image: np.ndarray, other: np.ndarray) -> np.ndarray:
 
     Args:
         image: (height, width, 3), uint8.
-        other: likewise.
+        other: (height, width, 3), uint8.
 
     Returns:
         (height, width, 3), uint8.

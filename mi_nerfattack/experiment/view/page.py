@@ -31,7 +31,7 @@ def serving(host: str, port: int) -> Iterator[viser.ViserServer]:
 
     Args:
         host: name or address to listen at.
-        port: 0 for any that is free; `get_port` of the server tells it.
+        port: 0 for any that is free; `get_port` of the server returns it.
 
     Raises:
         InputError: nothing can listen there, as where something else does.
@@ -91,12 +91,12 @@ def write_view(
 ) -> None:
     """Write the scene, and one drive as it goes on, each frame before its camera.
 
-    Cost: what `FrameSource` tells, for all frames, each twice with an attack.
+    Cost: all frames at the cost that `FrameSource` states, twice with an attack.
 
     Args:
         path: HTML file.
-        contents: what is shown; looks of other drives than its own are left out.
-        on_frame: told how many frames are done, of how many.
+        contents: what is shown; textures of other drives are left out.
+        on_frame: called with frames done and all frames.
 
     Raises:
         InputError: the drive's environment cannot be opened.

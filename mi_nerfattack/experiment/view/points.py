@@ -49,7 +49,7 @@ def scene_cloud(
     Args:
         world: of the run.
         states: (n, 3) of a drive, metres and radians.
-        on_frame: told how many frames are done, of how many.
+        on_frame: called with frames done and all frames.
     """
     sensor = world.without_objects().through(0)
     environment = SurrogateEnvironment(sensor, kinematic_vehicle(world.place))

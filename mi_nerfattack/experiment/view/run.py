@@ -47,10 +47,10 @@ class ViewedRun:
         """Return a drive that is shown.
 
         Args:
-            name: as of :func:`drive_name`; past the attack in the surrogate by default.
+            name: see :func:`drive_name`; by default the attack in the surrogate.
 
         Raises:
-            InputError: there is none of that name.
+            InputError: no drive has that name.
         """
         names = {drive_name(drive): drive for drive in self.shown}
         name = name or f"{SURROGATE}: {ATTACK}"
@@ -70,14 +70,14 @@ class ViewedRun:
         """Return where the objects stand.
 
         Args:
-            case: of a drive; without objects, where they would be.
-            moved: offsets (6,) by number of the object, in place of the case's own.
+            case: of a drive; a case without objects gives the places of `attack`.
+            moved: offsets (6,) by number of the object, instead of the case's offsets.
         """
         self.show(case if self.looks[case] is not None else ATTACK, moved)
         return [posed.placed for posed in self.world.surrogate.objects]
 
     def show(self, case: str, moved: Mapping[int, np.ndarray]) -> None:
-        """Give the world's objects the look of a case, and their places."""
+        """Give the world's objects the appearance of a case, and their places."""
         look = self.looks[case]
         assert look is not None, "a case with objects"
         offsets = look.offsets.copy()

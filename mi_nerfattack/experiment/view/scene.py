@@ -78,7 +78,7 @@ def read_contents(
     Args:
         folder: of the run.
         drive: shown first, see :meth:`ViewedRun.drive`.
-        on_frame: told how many frames were looked at, of how many.
+        on_frame: called with frames done and all frames.
 
     Raises:
         InputError: as of :func:`read_viewed`, or there is no such drive.
@@ -115,7 +115,7 @@ class RunScene:
 
     Args:
         scene: of the server, empty.
-        contents: what stands there.
+        contents: the point cloud, objects and drives of the run.
     """
 
     def __init__(self, scene: viser.SceneApi, contents: Contents) -> None:

@@ -1,4 +1,4 @@
-"""The report of a comparison: how close a field is to the scene it stands for."""
+"""The report of a comparison: how close a field is to the scene that it shows."""
 
 from __future__ import annotations
 

@@ -64,15 +64,15 @@ def _embedded(path: str | Path) -> Markup:
 
 @dataclass(frozen=True)
 class Pane:
-    """One of the pictures that change together.
+    """One of several panes whose pictures change together.
 
     Attributes:
-        title: above it.
-        alt: what is to be seen, for those who cannot see it.
+        title: above the pictures.
+        alt: describes the pictures to readers who cannot see them.
         sheet: address of one image that holds all pictures, below each other.
         width: of a picture, pixels.
-        height: likewise.
-        labels: a line a picture.
+        height: of a picture, pixels.
+        labels: one line per picture.
     """
 
     title: str
@@ -85,10 +85,10 @@ class Pane:
 
 @dataclass(frozen=True)
 class Scrubber:
-    """Panes of as many pictures each, beside each other.
+    """Panes next to each other, each with the same number of pictures.
 
     Attributes:
-        title: of them all.
+        title: above all panes.
         panes: at least one.
         start: index of the picture that is shown first.
         period_s: seconds that a picture is shown for when they play.
@@ -156,7 +156,7 @@ class RunPart:
     """A finished run, as a page shows it.
 
     Attributes:
-        label: that tells it from the others.
+        label: name of the run, different from the names of other runs.
         document: as of `metrics.metrics_document`, with all that follows.
         scenario: the scenario file as run.
         made_with: version of each program by its name.
@@ -164,7 +164,7 @@ class RunPart:
         repeat: the command that makes the run again.
         pictures: image files by title, by section.
         scrubbers: by section.
-        missing: by section, why there is nothing, and what makes it.
+        missing: by section, why it is empty, and which command fills it.
     """
 
     label: str
@@ -183,13 +183,13 @@ class SweepPart:
     """A sweep.
 
     Attributes:
-        label: that tells it from the others.
+        label: name of the sweep, different from the names of other sweeps.
         document: as of `sweep.summary.summarise`.
-        attacks: a row for each cell and environment: labels, figures by case, and the
-            command that repeats it.
-        shown: of each route and method the cell of middle damage.
+        attacks: one row per cell and environment: labels, figures by case, and the
+            command that repeats the cell.
+        shown: one cell per route and method, the cell of middle damage.
         pictures: image files by title.
-        notes: what is missing, and what makes it.
+        notes: what is missing, and which command makes it.
     """
 
     label: str
@@ -205,7 +205,7 @@ class TransferPart:
     """A transfer.
 
     Attributes:
-        label: that tells it from the others.
+        label: name of the transfer, different from the names of other transfers.
         document: whole, as of `transfer.figures.make_document`.
         quality: plot against the quality of surrogates, None without.
     """
@@ -220,7 +220,7 @@ class RetrainPart:
     """A retraining.
 
     Attributes:
-        label: that tells it from the others.
+        label: name of the retraining, different from the names of other retrainings.
         document: with `table`, of `retrain.compare.table_rows`.
     """
 
@@ -233,10 +233,10 @@ class Parts:
     """All that a page shows.
 
     Attributes:
-        runs: that were named one by one.
-        sweeps: likewise.
-        transfers: likewise.
-        retrainings: likewise.
+        runs: that the user names one by one, not through a sweep.
+        sweeps: that the user names.
+        transfers: that the user names.
+        retrainings: that the user names.
         damage: plots of several attacks by title.
     """
 

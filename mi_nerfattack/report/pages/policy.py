@@ -83,10 +83,10 @@ def write_policy_page(
     """Write `NAME.md`, `NAME.card.json` and `NAME.png`.
 
     Args:
-        folder: exists; NAME is that of the policy's file.
+        folder: an existing folder; NAME is the name of the policy's file.
         about: of the evaluation, JSON: `policy`, `command`, `settings`,
             `environments`, `versions`, `seconds_a_drive` and more.
-        record: what training wrote beside the policy; None where there is nothing.
+        record: of the policy's training; None without a record.
         card: {ENVIRONMENT: {ROUTE: {CASE: figures}}}.
         drives: of the card, and of the expert as case "expert".
 
@@ -120,7 +120,7 @@ def page_text(name: str, document: Mapping[str, Any]) -> str:
 
     Args:
         name: of the policy.
-        document: content of the JSON beside it.
+        document: content of the JSON file next to the page.
     """
     rows = list(card_rows(document["environments"]))
     runs = [{**cell, **run} for cell in rows for run in cell["per_run"]]
@@ -190,7 +190,7 @@ def summary(card: Mapping[str, Any]) -> str:
 
 
 def training_facts(record: TrainingRecord) -> dict[str, Any]:
-    """Pick what a page shows from what training wrote beside the policy."""
+    """Pick what a page shows from the record of a training."""
     shown = record.model_dump(mode="json", include={*_SHOWN, "settings"})
     return {**shown, "rounds": [_round(rows) for rows in record.training]}
 

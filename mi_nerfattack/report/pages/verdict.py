@@ -24,12 +24,12 @@ MIN_VIEWS = 3  # from which on a mean is worth something
 
 @dataclass(frozen=True)
 class Subject:
-    """What a field stands for, in the words of a verdict.
+    """The words of a verdict for one kind of field: a scene, a route or an object.
 
     Attributes:
         use: what the field must be good enough for.
-        views: what judges it.
-        reach: where it is good enough, as far as the views tell.
+        views: name of the views that judge the field.
+        reach: from where it is good enough, according to the views.
         few: advice where there are few views.
         blurred: where the mean PSNR is low.
         worst: where one view is bad.
@@ -110,7 +110,7 @@ class Criterion:
         limit: of the value.
         at_least: whether the limit is the least good value, or else the greatest.
         advice: what helps if it is not met.
-        subject: what the field stands for.
+        subject: words for the kind of field that was measured.
     """
 
     figure: str
@@ -130,7 +130,7 @@ class Criterion:
 
 
 def pooled_db(psnr_db: Sequence[float]) -> float:
-    """Return the PSNR of the mean of the squared errors that PSNRs stand for."""
+    """Return the PSNR of the mean squared error over views with these PSNRs."""
     error = float(np.mean(10 ** (-0.1 * np.asarray(psnr_db, np.float64))))
     return float("inf") if error == 0 else -10 * float(np.log10(error))
 
@@ -146,7 +146,7 @@ def judge(
     Args:
         scores: of the views, at least one.
         fitted_db: PSNR of the rays fitted to, at the end of the fit; None if unknown.
-        subject: what the field stands for.
+        subject: words for the kind of field.
         depth_m: median error of the depth near the camera, metres; NaN if unknown.
     """
     found: list[Criterion] = []

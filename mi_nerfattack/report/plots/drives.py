@@ -136,10 +136,10 @@ def _draw_errors(axis: Axes, case: str, drives: Sequence[Drive], signed: bool) -
 def control_change(
     path: str | Path, drives: Sequence[Drive], base: Drive, unit: str
 ) -> None:
-    """Plot by how much controls differ from those of a drive, step by step.
+    """Plot how much controls differ from the controls of a drive, step by step.
 
-    Of several controls, the first one is plotted, which steers.
-    Random looks appear as the range over their runs and its mean.
+    Of several controls, the plot shows the first one, which steers. Random textures
+    appear as the range over their runs and its mean.
 
     Args:
         path: PNG file.

@@ -33,7 +33,7 @@ MAX_RESOLUTION = 28
 
 
 class MagnitudeField(AbstractField):
-    """A grid field's geometry, with numbers of its vertices in place of colours.
+    """A grid field's geometry, with numbers at its vertices instead of colours.
 
     Not differentiable.
 
@@ -86,7 +86,7 @@ class SideView:
     Attributes:
         name: of the side.
         colour: (height, width, 3), sRGB in [0, 1], over white.
-        heat: (height, width), gradient per volume, NaN beside the object.
+        heat: (height, width), gradient per volume, NaN outside of the object.
     """
 
     name: str
@@ -97,9 +97,9 @@ class SideView:
 def surface_heat(grid: GridField, gradient: np.ndarray) -> np.ndarray:
     """Turn a texture's gradient into numbers that one level's vertices hold.
 
-    The gradient at a vertex adds up what the surface within a voxel around it
-    contributes; on the chosen level, the finest of at most `MAX_RESOLUTION` vertices
-    along an edge, it is divided by the volume of that voxel.
+    The gradient at a vertex adds up the contributions of the surface within a voxel
+    around the vertex. So it is divided by the volume of that voxel. The level is the
+    finest with at most `MAX_RESOLUTION` vertices along an edge.
 
     Args:
         grid: the object.
@@ -144,9 +144,10 @@ def side_views(
 def write_heat(
     path: str | Path, objects: Mapping[str, Sequence[SideView]], unit: str = "cost"
 ) -> None:
-    """Write a picture: two rows an object, as it looks and its heat, a column a side.
+    """Write a picture with two rows per object and one column per side.
 
-    The colours of all objects have one scale, from zero to the 99.5th percentile.
+    The first row of an object shows its appearance, the second row shows its heat. The
+    heat of all objects has one scale, from zero to the 99.5th percentile.
 
     Args:
         path: PNG file.

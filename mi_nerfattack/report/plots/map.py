@@ -90,8 +90,8 @@ def write_maps(
 
     Args:
         path: PNG file.
-        panels: above each other where the piece is wide, else beside each other; all
-            with a ground or none.
+        panels: next to each other, or above each other where the piece of ground is
+            wide. All of them have a ground, or none has one.
         route: with its lane.
         limit: departure limit, metres; steps beyond are marked with crosses.
         extent: of the piece, and of all grounds.

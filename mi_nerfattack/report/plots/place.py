@@ -107,7 +107,7 @@ def place_picture(
         overhead: camera of all grounds.
         grounds: rendered pictures from above by title.
         looks: pictures through cameras by title.
-        told: sentences below.
+        told: sentences below the pictures.
         title: above all.
     """
     looks = looks or {}

@@ -32,7 +32,7 @@ class Around:
 
     Args:
         lower: (3,), corner of the box in the object's frame, metres.
-        upper: likewise.
+        upper: (3,), opposite corner of the box in the object's frame, metres.
         azimuths_deg: of the eyes, about z from +x.
         edge_px: longer edge of the frames.
     """

@@ -70,13 +70,14 @@ def plot_attribution(
 ) -> None:
     """Plot how sensitive the objective is and when its gradient is made, over time.
 
-    Three panels with one time axis: the lengths of the costates (what a shift or a
-    turn of the vehicle at that time would change), the share of each control period
-    in the texture's gradient, and the distance from the lane centre.
+    Three panels have one time axis. The first shows the lengths of the costates: how a
+    shift or a turn of the vehicle at that time would change the objective. The second
+    shows the share of each control period in the texture's gradient, and the third the
+    distance from the lane centre.
 
     Args:
         path: PNG file.
-        data: of one drive, or of a batch: then a thin line a vehicle, and the mean.
+        data: of one drive, or of a batch: then one thin line per vehicle, and the mean.
         subject: what the shares are of.
     """
     with chart(path, 6.6) as figure:

@@ -38,10 +38,11 @@ class Line:
 def plot_transfer(path: str | Path, document: Mapping[str, Any]) -> None:
     """Draw the mean distance from the lane centre of every case.
 
-    A block an environment: the other cases in the mean over all attacks, the attacks
-    in the mean and, if there are few, each for itself; a column a condition. Of the
-    attacks, a cell tells below the mean how many have a wheel out for a second.
-    Nothing was driven where a cell is grey: light has no effect on a field.
+    Each environment has a block of lines, and each condition has a column. In a block,
+    each case has one line, the mean over all attacks. If the attacks are few, each
+    attack has a line, too. Below the mean error of the attacks, a cell shows how many
+    of them have a wheel out for a second. Nothing was driven where a cell is grey,
+    because light has no effect on a field.
 
     Args:
         path: PNG file.

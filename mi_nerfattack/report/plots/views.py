@@ -1,4 +1,4 @@
-"""Pictures of views beside each other: wanted, shown, how far apart, and depth."""
+"""Pictures of views next to each other: wanted, shown, how far apart, and depth."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def write_depths(
     unit: str = "m",
     titles: tuple[str, str] = ("field", "known"),
 ) -> None:
-    """Write the field's depth of views below each other, beside the known one.
+    """Write the field's depth of views below each other, next to the known depth.
 
     Grey is where the field stops less than half of the light, or nothing is known.
 
@@ -59,7 +59,7 @@ def write_depths(
         path: PNG file.
         views: at least one, with their pictures, all of one size.
         unit: of the depths, for the labels.
-        titles: of the column of the field, and of that of what is known.
+        titles: of the columns with the field's depth and with the known depth.
     """
     pictures = _pictures(views)
     shown = [pair.shown.solid_depth for pair in pictures]
