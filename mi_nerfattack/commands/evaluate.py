@@ -142,7 +142,7 @@ class Evaluate:
         """Check everything that can be checked before the first drive."""
         from mi_nerfattack.drives.store import Store
         from mi_nerfattack.evaluation.work import EvaluateDrives, check_policy
-        from mi_nerfattack.scenario.section import misfit
+        from mi_nerfattack.scenario.policy.base import misfit
         from mi_nerfattack.scenario.world import at_own_speed
 
         file = PolicyFile.read(self.policy, self.settings)

@@ -183,7 +183,7 @@ def section_content(section: Section) -> dict[str, Any]:
         if isinstance(value, NamedFile):
             values.pop(str(key))
             values[f"{key}_sha256"] = value.content()["sha256"]
-    return values
+    return values | ({"package": section.package} if section.package else {})
 
 
 def portable_text(section: Section, text: str) -> str:

@@ -36,12 +36,12 @@ from mi_nerfattack.scenario.deployment import (
 from mi_nerfattack.scenario.named_file import File, NamedFile, portable_text
 from mi_nerfattack.scenario.objective import ObjectiveSection
 from mi_nerfattack.scenario.objects import FieldObjectSection, ObjectSection, Triple
+from mi_nerfattack.scenario.policy.base import misfit
 from mi_nerfattack.scenario.policy.kinds import PolicySection, build_differentiable
 from mi_nerfattack.scenario.section import (
     CameraSection,
     NamedCameraSection,
     Section,
-    misfit,
     problems,
     refuse,
     rig_of,

@@ -33,6 +33,7 @@ from pydantic import (
     Tag,
     TypeAdapter,
     ValidationError,
+    ValidationInfo,
     WrapValidator,
     model_validator,
 )
@@ -73,11 +74,27 @@ class Section(BaseModel):
     )
     #: Keys that do not count at their defaults: digests from before them stay.
     later: ClassVar[tuple[str, ...]] = ()
+    #: Entry points by which other packages offer kinds; "" where they cannot.
+    group: ClassVar[str] = ""
+    #: Name and version of the other package that offers this kind; results record it.
+    package: ClassVar[str] = ""
 
     @classmethod
     def defaults(cls) -> dict[str, Any]:
         """Return the keys of the table and their defaults."""
         return {name: field.default for name, field in cls.model_fields.items()}
+
+    @classmethod
+    def offered(cls, name: str, known: Sequence[str]) -> type[Section]:
+        """Return the section of a kind that another package offers; `find` raises."""
+        from mi_nerfattack.system import entry_points
+
+        offer = entry_points.find(cls.group, name, known)
+        kind = offer.subclass(cls)
+        if _kinds_of(kind) != (name,):
+            raise offer.refuse(f'{kind.__name__} needs kind: Literal["{name}"]')
+        kind.package = offer.package
+        return kind
 
     def leaves(self) -> Iterator[tuple[Location, Any]]:
         """Yield the location of each value that counts, and the value."""
@@ -118,21 +135,22 @@ class Kinds:
     Args:
         default: the kind of a table without the key; or a function that tells it by
             the other keys.
+        family: section whose `group` names entry points of further kinds.
     """
 
     default: str | Callable[[dict[str, Any]], str] | None = None
+    family: type[Section] = Section
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
         """Return a schema that chooses by the kind, and always writes it."""
         union = Annotated[source, Field(discriminator="kind")]
-        return core_schema.no_info_wrap_validator_function(
-            lambda data, read: self._read(get_args(source), data, read),
+        return core_schema.with_info_wrap_validator_function(
+            lambda data, read, info: self._read(get_args(source), data, read, info),
             handler.generate_schema(union),
             serialization=core_schema.wrap_serializer_function_ser_schema(
-                lambda value, write: {"kind": value.kind} | write(value),
-                schema=handler.generate_schema(union),
+                _written, info_arg=True, schema=handler.generate_schema(union)
             ),
         )
 
@@ -149,11 +167,23 @@ class Kinds:
         return {"oneOf": [*([{"$ref": default}] if default else []), *kinds]}
 
     def _read(
-        self, members: tuple[Any, ...], data: Any, read: Callable[[Any], Any]
+        self,
+        members: tuple[Any, ...],
+        data: Any,
+        read: Callable[[Any], Any],
+        info: ValidationInfo,
     ) -> Any:
         if isinstance(data, dict) and data.get("kind") is None:
             kind = self.default(data) if callable(self.default) else self.default
             data = {"kind": kind, **{k: v for k, v in data.items() if k != "kind"}}
+        known = [kind for member in members for kind in _kinds_of(member)]
+        kind = data["kind"] if isinstance(data, dict) else getattr(data, "kind", None)
+        if self.family.group and isinstance(kind, str) and kind not in known:
+            try:
+                other = self.family.offered(kind, known)
+            except InputError as err:
+                refuse("kind", str(err))
+            return other.model_validate(data, context=info.context)
 
         def reword(error: ErrorDetails) -> tuple[str, Location, str]:
             what, location, message = error["type"], error["loc"], error["msg"]
@@ -166,6 +196,14 @@ class Kinds:
             return what, location[1:], message
 
         return _reworded(lambda: read(data), reword)
+
+
+def _written(value: Any, write: Callable[[Any], Any], info: Any) -> dict[str, Any]:
+    """Write a section with its kind, whatever its defaults."""
+    if isinstance(value, Section) and value.package:  # no member of the union
+        how = {"mode": info.mode, "exclude_defaults": info.exclude_defaults}
+        return {"kind": value.kind} | value.model_dump(**how)
+    return {"kind": value.kind} | write(value)
 
 
 _T = TypeVar("_T")
@@ -212,7 +250,7 @@ def _told(members: tuple[Any, ...], what: str, kind: str, key: str) -> str:
 
 
 def _kinds_of(member: Any) -> tuple[str, ...]:
-    return get_args(get_type_hints(member)["kind"])
+    return get_args(get_type_hints(member).get("kind"))
 
 
 def _error(
@@ -264,6 +302,7 @@ def _leaves(location: Location, value: Any) -> Iterator[tuple[Location, Any]]:
         keys, usual = type(value).model_fields.items(), value.defaults()
         inner = [(k, getattr(value, k)) for k, field in keys if not field.exclude]
         inner = [(k, v) for k, v in inner if k not in value.later or v != usual[k]]
+        inner += [("package", value.package)] if value.package else []
     elif is_dataclass(value) and hasattr(value, "kind"):
         inner = list(vars(value).items())
     elif isinstance(value, tuple) and value and isinstance(value[0], Section):
@@ -280,37 +319,6 @@ def _frozen(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _frozen(item) for key, item in value.items()}
     return tuple(map(_frozen, value)) if isinstance(value, list) else value
-
-
-def misfit(given: str | None, taken: str | None, source: str) -> str:
-    """Say why a vehicle does not take a policy's control; nothing if it may.
-
-    Args:
-        given: unit of the policy's control; None where nothing says it.
-        taken: unit of the vehicle's, likewise.
-        source: of the policy, for the message.
-    """
-    if None in (given, taken) or given == taken:
-        return ""
-    return (
-        f"takes {taken}, and {source} gives {given}; take another of them, or convert "
-        "the control by policy.control_scale"
-    )
-
-
-def check_count(given: int, names: Sequence[str]) -> None:
-    """Refuse a policy that gives more or fewer controls than its vehicle takes.
-
-    Args:
-        given: number of the policy's.
-        names: of the vehicle's.
-    """
-    if given != len(names):
-        refuse(
-            "policy.output",
-            f"the policy gives {given}, the vehicle takes {len(names)}: "
-            f"{', '.join(names)}; give a column for each",
-        )
 
 
 class AbstractCameraSection(Section):

@@ -113,7 +113,7 @@ class PolicyFile:
         Raises:
             InputError: the policy's file and the section [vehicle] differ.
         """
-        from mi_nerfattack.scenario.section import misfit
+        from mi_nerfattack.scenario.policy.base import misfit
 
         section, vehicle = self.section, self.vehicle
         if vehicle is None or not vehicle.has_expert:
