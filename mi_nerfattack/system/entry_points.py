@@ -9,8 +9,9 @@ from __future__ import annotations
 import functools
 import hashlib
 import importlib
+import inspect
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -44,10 +45,13 @@ class Offer:
     source: str
 
     def subclass(self, base: type[_T]) -> type[_T]:
-        """Return the value; raise `InputError` unless it is a class of this base."""
-        if isinstance(self.value, type) and issubclass(self.value, base):
-            return self.value
-        raise self.refuse(f"is {self.value!r}; name a subclass of {base.__name__}")
+        """Return the value; raise `InputError` unless it is a whole class of a base."""
+        if not (isinstance(self.value, type) and issubclass(self.value, base)):
+            raise self.refuse(f"is {self.value!r}, no subclass of {base.__name__}")
+        if inspect.isabstract(self.value):
+            missing = ", ".join(sorted(self.value.__abstractmethods__))
+            raise self.refuse(f"{self.value.__name__} has no {missing}")
+        return self.value
 
     def refuse(self, reason: str) -> InputError:
         """Return the error that a value of another type is."""
@@ -59,23 +63,23 @@ def names(group: str) -> list[str]:
     return sorted({point.name for point in entry_points(group=group)})
 
 
-def find(group: str, name: str, known: Sequence[str]) -> Offer:
+def find(group: str, name: str, known: Iterable[str], where: str = "is ") -> Offer:
     """Import what another package offers under a name.
 
     Args:
         group: of entry points.
         name: of the entry point.
         known: names that this package has, for the message.
+        where: begins the message of an unknown name.
 
     Raises:
-        InputError: no package offers it, several do, or it cannot be imported; the
-            message of the first begins with "is", for the caller says what is wrong.
+        InputError: no package offers it, several do, or it cannot be imported.
     """
     if name not in (offered := names(group)):
-        others = ", ".join(f'"{item}"' for item in offered)
-        others = f", and of other packages {others}" if others else ""
         allowed = ", ".join(f'"{item}"' for item in known)
-        raise InputError(f"is {name!r}; one of {allowed}{others}")
+        others = ", ".join(f'"{item}"' for item in offered)
+        others = f", or of other packages {others}" if others else ""
+        raise InputError(f"{where}{name!r}; one of {allowed}{others}")
     return _load(group, name)
 
 
@@ -103,8 +107,6 @@ def register_plugin(name: str) -> bool:
 
 def plugin_packages(types: Sequence[str]) -> str:
     """Return the packages that offer Mitsuba plugins of these types; "" for none."""
-    if not types:
-        return ""
     found = sorted(set(types) & set(names(PLUGINS)))
     return ", ".join(_load(PLUGINS, name).package for name in found)
 
