@@ -188,7 +188,7 @@ class AbstractSearchMethod(AbstractMethod):
 
     @abstractmethod
     def search(self, task: Task) -> AbstractSearch:
-        """Make what proposes textures."""
+        """Make what proposes textures; it draws from the task's seed alone."""
 
     def iterations(self, frames: int) -> int:
         """See :meth:`AbstractMethod.iterations`."""
@@ -217,7 +217,7 @@ class BlockMethod(AbstractSearchMethod):
         proposals = self.iterations(task.frames)
         fields = task.fields
         rest = proposals, self.first_block, task.seed
-        return BlockSearch(_colourings(task), fields, *rest)
+        return BlockSearch(task.colourings, fields, *rest)
 
 
 class EvolutionMethod(AbstractSearchMethod):
@@ -232,7 +232,7 @@ class EvolutionMethod(AbstractSearchMethod):
     def search(self, task: Task) -> AbstractSearch:
         from mi_nerfattack.attack.black_box.evolution import EvolutionSearch
 
-        basis = LowFrequency(_colourings(task), self.coefficients)
+        basis = LowFrequency(task.colourings, self.coefficients)
         rest = self.variant, self.spread, self.population, task.seed
         return EvolutionSearch(basis, *rest)
 
@@ -246,13 +246,8 @@ class BayesianMethod(AbstractSearchMethod):
     def search(self, task: Task) -> AbstractSearch:
         from mi_nerfattack.attack.black_box.bayesian import BayesianSearch
 
-        basis = LowFrequency(_colourings(task), self.coefficients)
+        basis = LowFrequency(task.colourings, self.coefficients)
         return BayesianSearch(basis, seed=task.seed)
-
-
-def _colourings(task: Task) -> list[Colours]:
-    found = [task.freedom.colouring(field) for field in task.fields]
-    return [item for item in found if isinstance(item, Colours)]  # which all are
 
 
 MethodSection = Annotated[

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from inspect import Parameter, signature
 from typing import Annotated, Any, ClassVar, Literal, get_type_hints
@@ -20,7 +20,7 @@ from mi_nerfattack.ranges import Count, Finite, NonNegative
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.scenario.named_file import FileOrFolder
-from mi_nerfattack.scenario.section import UNTAGGED, Kinds, Section
+from mi_nerfattack.scenario.section import UNTAGGED, Kinds, Section, read_offered
 
 #: Name of the environment of attacks.
 SURROGATE = "surrogate"
@@ -50,25 +50,22 @@ class AbstractDeploymentSection(Section):
         return {}
 
     @classmethod
-    def offered(cls, name: str, known: Sequence[str]) -> type[Section]:
+    def offered(cls, name: str, known: Iterable[str]) -> tuple[type[Section], str]:
         """Make a section of the further arguments of another package's function.
 
         Raises:
             InputError: no package offers it, or an argument has no type.
         """
-        del known
-        offer = offered_environment(name, "is ")
-        _, _, *further = signature(offer.value).parameters
+        offer = offered_environment(name, "is ", known)
+        parameters = dict(list(signature(offer.value).parameters.items())[2:])
         hints = get_type_hints(offer.value, include_extras=True)
         keys: dict[str, Any] = {"kind": (Literal[name], ...)}
-        for key in further:
+        for key, parameter in parameters.items():
             if key not in hints or key in OfferedDeployment.model_fields:
                 raise offer.refuse(f"argument {key!r} has no type, or is taken")
-            value = signature(offer.value).parameters[key].default
-            keys[key] = (hints[key], ... if value is Parameter.empty else value)
-        kind = create_model(name, __base__=OfferedDeployment, **keys)
-        kind.package = offer.package
-        return kind
+            is_needed = parameter.default is Parameter.empty
+            keys[key] = (hints[key], ... if is_needed else parameter.default)
+        return create_model(name, __base__=OfferedDeployment, **keys), offer.package
 
 
 class AbstractSimulatedDeployment(AbstractDeploymentSection):
@@ -137,6 +134,10 @@ class OfferedDeployment(AbstractSimulatedDeployment):
         """The keys that are arguments of the package's function."""
         ours = {*OfferedDeployment.model_fields, "kind"}
         return {key: value for key, value in self if key not in ours}
+
+    def __reduce__(self) -> Any:
+        """Let another process make the class again, which no module has."""
+        return read_offered, (AbstractDeploymentSection, dict(self))
 
 
 DeploymentSection = Annotated[

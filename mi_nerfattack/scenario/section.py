@@ -8,7 +8,7 @@ a real car reads it, too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, is_dataclass, replace
 from inspect import signature
 from pathlib import Path
@@ -30,6 +30,7 @@ from pydantic import (
     Field,
     GetCoreSchemaHandler,
     GetJsonSchemaHandler,
+    PrivateAttr,
     Tag,
     TypeAdapter,
     ValidationError,
@@ -53,14 +54,13 @@ from mi_nerfattack.render.camera.rig import Rig
 
 Trust = Annotated[bool, Field(exclude=True)]  # results do not depend on it
 
-
 #: Of a control: a heading rate, a steering angle, or another quantity.
 Unit = Literal["rad/s", "rad", "other"]
-Turn = Annotated[float, Field(ge=-180, le=180)]  # of a camera, degrees
 
 #: Keys and indices that lead to a value of the file.
 Location = tuple[str | int, ...]
 
+_Reader = Callable[[Any], Any]
 _WORDS = {"tuple_type": "must be an array", "model_type": "must be a table"}
 _UNKNOWN = ("unknown", "unexpected_keyword_argument")
 _WORDS |= {"model_attributes_type": "must be a table", "missing": "is missing"}
@@ -76,25 +76,25 @@ class Section(BaseModel):
     later: ClassVar[tuple[str, ...]] = ()
     #: Entry points by which other packages offer kinds; "" where they cannot.
     group: ClassVar[str] = ""
-    #: Name and version of the other package that offers this kind; results record it.
-    package: ClassVar[str] = ""
+    _package: str = PrivateAttr("")
 
     @classmethod
     def defaults(cls) -> dict[str, Any]:
         """Return the keys of the table and their defaults."""
         return {name: field.default for name, field in cls.model_fields.items()}
 
+    @property
+    def package(self) -> str:
+        """Name and version of the other package that offers this kind, or ""."""
+        return self._package
+
     @classmethod
-    def offered(cls, name: str, known: Sequence[str]) -> type[Section]:
-        """Return the section of a kind that another package offers; `find` raises."""
+    def offered(cls, name: str, known: Iterable[str]) -> tuple[type[Section], str]:
+        """Return another package's class, and the package; as `find`, it raises."""
         from mi_nerfattack.system import entry_points
 
         offer = entry_points.find(cls.group, name, known)
-        kind = offer.subclass(cls)
-        if _kinds_of(kind) != (name,):
-            raise offer.refuse(f'{kind.__name__} needs kind: Literal["{name}"]')
-        kind.package = offer.package
-        return kind
+        return offer.subclass(cls, name), offer.package
 
     def leaves(self) -> Iterator[tuple[Location, Any]]:
         """Yield the location of each value that counts, and the value."""
@@ -102,7 +102,7 @@ class Section(BaseModel):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _read(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
+    def _read(cls, data: Any, handler: _Reader) -> Any:
         """Make tuples of lists, which strict models take; say which keys there are."""
         if not isinstance(data, dict):
             return handler(data)
@@ -117,7 +117,7 @@ class Section(BaseModel):
         return _reworded(lambda: handler(_frozen(data)), reword)
 
 
-def _untagged(data: Any, read: Callable[[Any], Any]) -> Any:
+def _untagged(data: Any, read: _Reader) -> Any:
     def reword(error: ErrorDetails) -> tuple[str, Location, str]:
         return error["type"], error["loc"][1:], error["msg"]
 
@@ -167,11 +167,7 @@ class Kinds:
         return {"oneOf": [*([{"$ref": default}] if default else []), *kinds]}
 
     def _read(
-        self,
-        members: tuple[Any, ...],
-        data: Any,
-        read: Callable[[Any], Any],
-        info: ValidationInfo,
+        self, members: tuple[Any, ...], data: Any, read: _Reader, info: ValidationInfo
     ) -> Any:
         if isinstance(data, dict) and data.get("kind") is None:
             kind = self.default(data) if callable(self.default) else self.default
@@ -180,10 +176,9 @@ class Kinds:
         kind = data["kind"] if isinstance(data, dict) else getattr(data, "kind", None)
         if self.family.group and isinstance(kind, str) and kind not in known:
             try:
-                other = self.family.offered(kind, known)
+                return read_offered(self.family, data, known, info.context)
             except InputError as err:
                 refuse("kind", str(err))
-            return other.model_validate(data, context=info.context)
 
         def reword(error: ErrorDetails) -> tuple[str, Location, str]:
             what, location, message = error["type"], error["loc"], error["msg"]
@@ -198,12 +193,24 @@ class Kinds:
         return _reworded(lambda: read(data), reword)
 
 
-def _written(value: Any, write: Callable[[Any], Any], info: Any) -> dict[str, Any]:
+def read_offered(
+    family: type[Section], data: Any, known: Iterable[str] = (), context: Any = None
+) -> Any:
+    """Make a section of another package of a table; see :meth:`Section.offered`."""
+    if isinstance(data, family):
+        return data
+    kind, package = family.offered(data["kind"], known)
+    section = kind.model_validate(data, context=context)
+    section._package = package
+    return section
+
+
+def _written(value: Any, write: _Reader, info: Any) -> dict[str, Any]:
     """Write a section with its kind, whatever its defaults."""
+    kind, how = {"kind": value.kind}, {"exclude_defaults": info.exclude_defaults}
     if isinstance(value, Section) and value.package:  # no member of the union
-        how = {"mode": info.mode, "exclude_defaults": info.exclude_defaults}
-        return {"kind": value.kind} | value.model_dump(**how)
-    return {"kind": value.kind} | write(value)
+        return kind | value.model_dump(mode=info.mode, **how)
+    return kind | write(value)
 
 
 _T = TypeVar("_T")
@@ -288,11 +295,8 @@ def problems(err: ValidationError) -> Iterator[tuple[Location, str]]:
         if kind == "too_short" and location in lists:
             continue  # its only item is wrong, and told
         message = _WORDS.get(kind, error["msg"])
-        given = (
-            ""
-            if kind in ("told", "unknown", "missing")
-            else f" (is {error['input']!r})"
-        )
+        is_worded = kind in ("told", "unknown", "missing")
+        given = "" if is_worded else f" (is {error['input']!r})"
         yield location, message[0].lower() + message[1:] + given
 
 
@@ -339,7 +343,7 @@ class AbstractCameraSection(Section):
     forward_m: Finite = 0.5
     pitch_deg: Annotated[float, Field(gt=-90, lt=90)] = 6.0
     left_m: Finite = 0.0
-    yaw_deg: Turn = 0.0  # to the left
+    yaw_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0  # to the left
     later: ClassVar[tuple[str, ...]] = ("left_m", "yaw_deg")
     lens: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
@@ -383,7 +387,7 @@ class NamedCameraSection(AbstractCameraSection):
 CameraSections = Annotated[tuple[NamedCameraSection, ...], Field(min_length=1)]
 
 
-def rig_of(cameras: Sequence[NamedCameraSection]) -> Rig:
+def rig_of(cameras: tuple[NamedCameraSection, ...]) -> Rig:
     """Make what a vehicle with several cameras sees by.
 
     Raises:

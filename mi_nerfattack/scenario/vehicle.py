@@ -77,7 +77,7 @@ class AbstractVehicleSection(Section):
         if self.package:
             car = self.car()
             limits = (car.max_control, *(item.highest for item in car.more_controls))
-            try_model(f"vehicle.kind: {self.kind}", model, limits)
+            try_model(f"vehicle.kind: {self.package}", model, limits)
         return Motion(model, integrator, self.substeps, self.delay_steps)
 
     def car(self) -> Car:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_type_hints
 
 from mi_nerfattack.errors import InputError, is_interrupt
 
@@ -44,14 +44,21 @@ class Offer:
     package: str
     source: str
 
-    def subclass(self, base: type[_T]) -> type[_T]:
-        """Return the value; raise `InputError` unless it is a whole class of a base."""
-        if not (isinstance(self.value, type) and issubclass(self.value, base)):
-            raise self.refuse(f"is {self.value!r}, no subclass of {base.__name__}")
-        if inspect.isabstract(self.value):
-            missing = ", ".join(sorted(self.value.__abstractmethods__))
-            raise self.refuse(f"{self.value.__name__} has no {missing}")
-        return self.value
+    def subclass(self, base: type[_T], name: str) -> type[_T]:
+        """Return the value.
+
+        Raises:
+            InputError: it is no subclass of a base whose attribute ``kind`` is a
+                `Literal` of this name, or it lacks methods.
+        """
+        if not (isinstance(kind := self.value, type) and issubclass(kind, base)):
+            raise self.refuse(f"is {kind!r}, no subclass of {base.__name__}")
+        if inspect.isabstract(kind):
+            missing = ", ".join(sorted(vars(kind)["__abstractmethods__"]))
+            raise self.refuse(f"{kind.__name__} has no {missing}")
+        if get_args(get_type_hints(kind).get("kind")) != (name,):
+            raise self.refuse(f'{kind.__name__} needs kind: Literal["{name}"]')
+        return kind
 
     def refuse(self, reason: str) -> InputError:
         """Return the error that a value of another type is."""

@@ -180,7 +180,7 @@ class Column:
     """An environment under a condition.
 
     Args:
-        environment: one of `ENVIRONMENTS`, or of another package, where objects are pasted.
+        environment: one of `ENVIRONMENTS`, or of another package, which pastes objects.
         condition: see there.
         spp: samples per pixel of path-traced images.
     """
