@@ -209,7 +209,8 @@ def _written(value: Any, write: _Reader, info: Any) -> dict[str, Any]:
     """Write a section with its kind, whatever its defaults."""
     kind, how = {"kind": value.kind}, {"exclude_defaults": info.exclude_defaults}
     if isinstance(value, Section) and value.package:  # no member of the union
-        return kind | value.model_dump(mode=info.mode, **how)
+        values = value.model_dump(mode=info.mode, **how)
+        return kind | values | {"package": value.package}
     return kind | write(value)
 
 

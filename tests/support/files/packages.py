@@ -48,10 +48,7 @@ def use_packages(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
     monkeypatch.setenv("PYTHONPATH", str(folder), prepend=":")
     importlib.invalidate_caches()
     entry_points._load.cache_clear()
-    for module in [x for x in sys.modules if _is_below(x, folder)]:
-        monkeypatch.delitem(sys.modules, module)
-
-
-def _is_below(module: str, folder: Path) -> bool:
-    file = getattr(sys.modules[module], "__file__", None)
-    return file is not None and Path(file).is_relative_to(folder)
+    names = {path.stem for path in folder.iterdir()}
+    for module in list(sys.modules):  # of the same package in another test
+        if module.partition(".")[0] in names:
+            monkeypatch.delitem(sys.modules, module)
