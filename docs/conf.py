@@ -53,7 +53,7 @@ highlight_language = "none"
 
 
 # Pages whose lists of links are the table of contents.
-CONTENTS = ("index", "tutorials/index", "results/findings/index")
+CONTENTS = ("index", "tutorials/index", "results/findings/index", "dev/extend/index")
 # The site shows these files as pages; in the repository a page links to each.
 CARDS = {
     "results/pilotnet": "scenes/policy/pilotnet.md",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from inspect import signature
 from typing import TYPE_CHECKING, Any
 
 from mi_nerfattack.deploy.built_in import built_in_shapes
@@ -226,8 +227,17 @@ def make_environment(
             missing or cannot be read, or a function that makes no environment.
     """
     conditions = conditions or Conditions()
-    make = ENVIRONMENTS.get(name) or offered_environment(name).value
-    environment = make(place, conditions, **(settings or {}))
+    make, settings = ENVIRONMENTS.get(name), settings or {}
+    if make is None:
+        make = offered_environment(name).value
+        try:
+            signature(make).bind(place, conditions, **settings)
+        except TypeError as err:
+            raise InputError(
+                f"environment: {name!r}: {err}; drive there by a scenario, whose "
+                "[deployment] gives it"
+            ) from err
+    environment = make(place, conditions, **settings)
     if not isinstance(environment, AbstractEnvironment):
         raise InputError(
             f"environment: {name!r}: its package makes {type(environment).__name__}; "

@@ -37,6 +37,10 @@ class Slow(AbstractVehicleSection):
         return Dubins(self.speed_ms)
     def handling(self):
         return {"max_control": 1.5}
+class Odd(Slow):
+    kind: Literal["odd"]
+    def handling(self):
+        return {"max_control": 1.5, "control_unit": "other"}
 class Bare(AbstractVehicleSection):
     kind: Literal["bare"]
 class Other(Slow):
@@ -48,12 +52,15 @@ def make(place, conditions, length: int = 2):
     raise AssertionError
 def untyped(place, conditions, length=2):
     raise AssertionError
+def needy(place, conditions, length: int):
+    raise AssertionError
 def nothing(place, conditions):
     return length
 length = 3
 """
 POINTS = {
     "vehicles.slow": "other.vehicle:Slow",
+    "vehicles.odd": "other.vehicle:Odd",
     "vehicles.bare": "other.vehicle:Bare",
     "vehicles.misnamed": "other.vehicle:Other",
     "vehicles.number": "other.vehicle:number",
@@ -63,6 +70,7 @@ POINTS = {
     "vehicles.dubins": "other.broken",
     "environments.long": "other.environment:make",
     "environments.untyped": "other.environment:untyped",
+    "environments.needy": "other.environment:needy",
     "environments.nothing": "other.environment:nothing",
     "environments.length": "other.environment:length",
     "conditions.length": "other.environment:length",
@@ -162,6 +170,7 @@ def test_a_vehicle_is_refused_with_its_package_and_the_cause(kind):
             lambda: make_environment("nothing", bundled_place()),
             "'nothing': its package makes int",
         ),
+        (lambda: make_environment("needy", bundled_place()), "'needy': .*'length'"),
         (lambda: make_columns(["none"], ["day"], 1), "--environments: 'none'.*'?long"),
         (lambda: parse_condition("length:1"), "other 1.0.*no class"),
         (lambda: parse_condition("nothing:x"), "--conditions: 'nothing:x'"),
@@ -172,6 +181,19 @@ def test_a_vehicle_is_refused_with_its_package_and_the_cause(kind):
 def test_other_extensions_are_refused(call, cause):
     with pytest.raises(InputError, match=cause):
         call()
+
+
+def test_a_vehicle_without_wheels_does_not_drive_in_mujoco(tmp_path):
+    odd = {"[drive]": '[vehicle]\nkind = "odd"\n[drive]'}
+    folder = write_scenario(tmp_path / "s", odd)
+    path = folder / "scenario.toml"
+    scenario, _ = load_scenario(path)
+    mitsuba, mujoco = make_columns(["mitsuba", "mujoco"], ["day"], 1)
+    mitsuba.check(scenario)
+    with pytest.raises(InputError, match="--environments: mujoco drives a car with"):
+        mujoco.check(scenario)
+    with pytest.raises(InputError, match="deployment: mujoco: .*car with wheels"):
+        load_scenario(path, settings=["deployment.kind=mujoco"])
 
 
 def test_a_name_that_two_packages_offer_is_refused(installed):

@@ -221,7 +221,9 @@ class Column:
 
     def check(self, scenario: Scenario) -> None:
         """Raise InputError unless a scenario's vehicle can drive there."""
-        if isinstance(scenario.vehicle, CustomSection) and "mujoco" in self.name:
+        vehicle = scenario.vehicle
+        is_custom = isinstance(vehicle, CustomSection) or vehicle.unit == "other"
+        if is_custom and "mujoco" in self.name:
             raise InputError(
                 f"--environments: {self.environment} drives a car with wheels, whose "
                 f"control is not that of the custom vehicle of {scenario.name!r}; "
