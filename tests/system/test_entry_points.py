@@ -184,7 +184,7 @@ def test_other_extensions_are_refused(call, cause):
 
 
 def test_a_vehicle_without_wheels_does_not_drive_in_mujoco(tmp_path):
-    odd = {"[drive]": '[vehicle]\nkind = "odd"\n[drive]'}
+    odd = {"[drive]": 'control_scale = 2.0\n[vehicle]\nkind = "odd"\n[drive]'}
     folder = write_scenario(tmp_path / "s", odd)
     path = folder / "scenario.toml"
     scenario, _ = load_scenario(path)
