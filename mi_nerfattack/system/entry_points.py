@@ -83,10 +83,8 @@ def find(group: str, name: str, known: Iterable[str], where: str = "is ") -> Off
         InputError: no package offers it, several do, or it cannot be imported.
     """
     if name not in (offered := names(group)):
-        allowed = ", ".join(f'"{item}"' for item in known)
-        others = ", ".join(f'"{item}"' for item in offered)
-        others = f", or of other packages {others}" if others else ""
-        raise InputError(f"{where}{name!r}; one of {allowed}{others}")
+        others = f", or of other packages {', '.join(offered)}" if offered else ""
+        raise InputError(f"{where}{name!r}; one of {', '.join(known)}{others}")
     return _load(group, name)
 
 

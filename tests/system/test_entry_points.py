@@ -143,7 +143,7 @@ def test_an_environment_takes_the_functions_arguments_as_keys():
 
 
 REFUSED = {
-    "slower": ("slower", '"dubins".*of other packages "bare", "broken"'),
+    "slower": ("slower", "dubins.*of other packages bare, broken"),
     "bare": ("other 1.0", "build, handling"),
     "misnamed": ("other 1.0", 'Literal."misnamed"'),
     "number": ("other 1.0", "AbstractVehicleSection"),
@@ -163,7 +163,10 @@ def test_a_vehicle_is_refused_with_its_package_and_the_cause(kind):
 @pytest.mark.parametrize(
     ("call", "cause"),
     [
-        (lambda: deployment(kind="short"), 'deployment.kind: is .short.*"mitsuba"'),
+        (
+            lambda: deployment(kind="short"),
+            "deployment.kind: is .short.*mitsuba, .*needy",
+        ),
         (lambda: deployment(kind="untyped"), "other 1.0.*'length' has no type"),
         (lambda: deployment(kind="length"), "other 1.0.*no function"),
         (
@@ -171,7 +174,10 @@ def test_a_vehicle_is_refused_with_its_package_and_the_cause(kind):
             "'nothing': its package makes int",
         ),
         (lambda: make_environment("needy", bundled_place()), "'needy': .*'length'"),
-        (lambda: make_columns(["none"], ["day"], 1), "--environments: 'none'.*'?long"),
+        (
+            lambda: make_columns(["none"], ["day"], 1),
+            "--environments: 'none'.*of other packages length, long",
+        ),
         (lambda: parse_condition("length:1"), "other 1.0.*no class"),
         (lambda: parse_condition("nothing:x"), "--conditions: 'nothing:x'"),
         (lambda: parse_condition("none:1"), "pitch, length, nothing, each once"),
