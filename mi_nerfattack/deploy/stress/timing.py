@@ -95,7 +95,7 @@ class LateFrames(AbstractAround):
         return self._frames[0]
 
     def begin(self, frame: CameraFrame, seed: int) -> CameraFrame:
-        """See :meth:`AbstractAround.begin`."""
+        """Forget the drive before; see the family."""
         del seed
         self._frames.extend([frame] * (self._frames.maxlen or 1))
         return frame
@@ -131,7 +131,7 @@ class DroppedFrames(AbstractAround):
         return self._last
 
     def begin(self, frame: CameraFrame, seed: int) -> CameraFrame:
-        """See :meth:`AbstractAround.begin`."""
+        """Forget the drive before; see the family."""
         self._draws = np.random.default_rng([seed, _STREAM])
         self._last = frame
         return frame
@@ -164,7 +164,7 @@ class LateControls(AbstractAround):
         return self._controls.popleft()
 
     def begin(self, frame: CameraFrame, seed: int) -> CameraFrame:
-        """See :meth:`AbstractAround.begin`."""
+        """Forget the drive before; see the family."""
         del seed
         count = len(self.control_names)
         none = 0.0 if count == 1 else np.zeros(count)
