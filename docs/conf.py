@@ -18,7 +18,7 @@ project = "mi-nerfattack"
 copyright = "The mi-nerfattack authors"
 
 extensions = [
-    "myst_parser",
+    "myst_nb",  # brings myst_parser
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "mathml",
@@ -27,6 +27,12 @@ extensions = [
 exclude_patterns = ["extensions", "examples", "pictures"]
 # Nothing is fetched, neither while the site is built nor while it is read.
 html_math_renderer = "mathml"
+
+# Notebooks are pages of text; only those with a kernel are run, at each build.
+nb_execution_mode = "force"
+nb_execution_timeout = 600
+nb_execution_raise_on_error = True
+nb_execution_show_tb = True
 
 myst_heading_anchors = 4
 myst_enable_extensions = ["dollarmath"]
@@ -53,7 +59,14 @@ highlight_language = "none"
 
 
 # Pages whose lists of links are the table of contents.
-CONTENTS = ("index", "tutorials/index", "results/findings/index", "dev/extend/index")
+CONTENTS = (
+    "index",
+    "car/index",
+    "notebooks/index",
+    "tutorials/index",
+    "results/findings/index",
+    "dev/extend/index",
+)
 # The site shows these files as pages; in the repository a page links to each.
 CARDS = {
     "results/pilotnet": "scenes/policy/pilotnet.md",

@@ -1,7 +1,8 @@
 """List the sentences, phrases and lines of a page that break the plain voice.
 
-    python docs/voice.py docs/start/install.md README.md
+    python docs/voice.py docs/start/install.md README.md mi_nerfattack/cli.py
 
+Of Python files, the docstrings of public names and the help texts of options are read.
 Each finding is printed with its page and line. The rules: a sentence has at most 35
 words, a line at most 100 characters, no phrase is one of PHRASES, and only pages of
 results name a machine. Tables may have long lines and sentences; code may have the
@@ -11,10 +12,12 @@ phrases.
 from __future__ import annotations
 
 import argparse
+import ast
+import inspect
 import re
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from markdown_it import MarkdownIt
@@ -68,7 +71,9 @@ _MACHINES = re.compile(
     r"|[AHV][12]00|RTX \w+|GTX \w+|Tesla [A-Z]\d+)\b"
 )
 _RESULTS = tuple(
-    f"docs/results/{x}" for x in ("bench.md", "table2/", "methods/", "matrix/")
+    f"docs/results/{x}"
+    for x in "bench.md car.md fields.md retrain.md training.md".split()
+    + "table2/ methods/ matrix/".split()
 )
 
 _SENTENCE_END = re.compile(r"(?<!\.\.)[.!?][)\]\"'”’*]*\s+")
@@ -205,9 +210,49 @@ def pages() -> dict[str, Path]:
     return {path.relative_to(ROOT).as_posix(): path for path in sorted(paths)}
 
 
+def prose_words(markdown: str) -> int:
+    """Count the words of a page without its code and tables."""
+    tokens = MarkdownIt().enable("table").parse(markdown)
+    return sum(len(x.text.split()) for x in passages(tokens) if not x.in_table)
+
+
+def modules() -> dict[str, Path]:
+    """Find the Python files of package and plugins, by their names."""
+    paths = [*ROOT.glob("mi_nerfattack/**/*.py"), *ROOT.glob("plugins/*.py")]
+    return {path.relative_to(ROOT).as_posix(): path for path in sorted(paths)}
+
+
+def docstrings(source: str) -> Iterator[Passage]:
+    """Find the docstrings of public names, and those of attributes: help texts."""
+    for node in _public(ast.parse(source)):
+        for expression in node.body:
+            value = expression.value if isinstance(expression, ast.Expr) else None
+            if isinstance(value, ast.Constant) and isinstance(value.value, str):
+                yield Passage(value.lineno, inspect.cleandoc(value.value), False)
+
+
+def _public(
+    node: ast.Module | ast.ClassDef | ast.FunctionDef,
+) -> Iterator[ast.Module | ast.ClassDef | ast.FunctionDef]:
+    yield node
+    if isinstance(node, ast.FunctionDef):
+        return
+    for child in node.body:
+        if isinstance(child, ast.ClassDef | ast.FunctionDef):
+            if not child.name.startswith("_"):
+                yield from _public(child)
+
+
 def findings_in(name: str, path: Path) -> list[Finding]:
     """Find what breaks the voice in a file; its name decides if it shows results."""
-    return findings(path.read_text("utf-8"), results=name.startswith(_RESULTS))
+    text = path.read_text("utf-8")
+    if path.suffix != ".py":
+        return findings(text, results=name.startswith(_RESULTS))
+    return [
+        replace(found, line=passage.line + found.line - 1)
+        for passage in docstrings(text)
+        for found in findings(passage.text)
+    ]
 
 
 def main() -> int:
@@ -217,7 +262,7 @@ def main() -> int:
     named = {name: Path(name) for name in parser.parse_args().pages}
     lines = [
         f"{name}:{found.line}: {found.kind}: {found.text}"
-        for name, path in (named or pages()).items()
+        for name, path in (named or {**pages(), **modules()}).items()
         for found in findings_in(name, path)
     ]
     print("\n".join(lines) or "no findings")

@@ -31,8 +31,8 @@ class DriveCommand:
     """Let a policy drive a car along a route, as long as a button is held.
 
     Whatever is old, lost, outside the fence or out of range brakes the car, centres its
-    wheels and ends the drive; so does letting the button go. docs/car/index.md lists
-    the keys of CONFIG: devices, route, fence and limits.
+    wheels and ends the drive; so does letting the button go. docs/car/reference.md
+    lists the keys of CONFIG: devices, route, fence and limits.
     """
 
     config: Annotated[

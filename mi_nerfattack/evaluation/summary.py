@@ -13,7 +13,7 @@ import pandas as pd
 RESAMPLES = 9999
 #: Fewer values, each independent, have no interval.
 FEWEST = 5
-#: Up to so many have a t interval, more a bootstrap: docs/howto/report.md#intervals has
+#: Up to so many have a t interval, more a bootstrap: docs/explain/intervals.md has
 #: the coverage of both.
 FEW = 15
 #: Largest standard error of a logarithm for a t interval of it: with more, as of values

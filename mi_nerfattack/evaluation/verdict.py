@@ -324,7 +324,7 @@ def _random_enough(name: str, cases: Figures) -> Iterator[str]:
     left, count = cases[RANDOM]["drives_departed"], cases[RANDOM]["n"]
     if left >= RANDOM_ENOUGH * count:
         yield (
-            f"random enough: in {name}, {left} of {count} drives past random looks "
+            f"random enough: in {name}, {left} of {count} drives with random textures "
             "leave the lane, so that an attack proves little about this policy; train "
             "it with such objects in view"
         )
@@ -358,8 +358,8 @@ def _noise(name: str, cases: Figures, has_objective: bool) -> Iterator[str]:
 def _noise_told(what: str, effect: float, noise: float, between: str) -> str:
     return (
         f"noise larger: the effect of the attack, {what}, is {effect:.3g}, and its "
-        f"standard deviation from {between} {noise:.3g}; take more starts, looks and "
-        "seeds"
+        f"standard deviation from {between} {noise:.3g}; take more starts, "
+        "textures and seeds"
     )
 
 

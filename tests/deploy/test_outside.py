@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -40,18 +41,18 @@ def test_carla_by_name(server):
     assert server.is_as_before
 
 
-DOCS = Path(__file__).parents[2] / "docs" / "howto/environments.md"
+DOCS = Path(__file__).parents[2] / "docs/howto"
 
 
-def documented(heading: str) -> str:
-    """The first Python block under a heading of the documentation."""
-    section = DOCS.read_text("utf-8").split(f"\n## {heading}\n")[1]
-    return section.split("```python\n")[1].split("```")[0]
+def documented(page: str) -> str:
+    """The first Python block of a page of the documentation."""
+    block = (DOCS / page).read_text("utf-8").split("```python\n")[1].split("```")[0]
+    return textwrap.dedent(block)
 
 
 def test_the_documented_drive_in_carla(server):
     names: dict = {}
-    exec(documented("CARLA"), names)
+    exec(documented("carla.md"), names)
     assert names["frame"].image.shape == (66, 200, 3)
     assert server.town == "Town03" and server.is_as_before
 
@@ -61,7 +62,7 @@ def test_the_documented_replay(tmp_path, monkeypatch):
     del topics["/camera/camera_info"]
     write_log(tmp_path / "drive.mcap", topics)
     monkeypatch.chdir(tmp_path)
-    code = documented("Replay").replace("366, 188, 75.0", "16, 8, 90.0")
+    code = documented("replay.md").replace("366, 188, 75.0", "16, 8, 90.0")
     names: dict = {}
     exec(code, names)
     assert names["environment"].reset(ROUTE).image.shape == (8, 16, 3)

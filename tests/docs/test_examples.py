@@ -89,7 +89,7 @@ SENSOR = """
 
 
 def test_the_script_writes_an_image_and_prints_the_gradients_shape(tmp_path):
-    script, _ = blocks("python")
+    (script,) = blocks("python")
     assert len([line for line in script.splitlines() if line]) <= 15
     total = "print(dr.sum(dr.abs(dr.grad(params[key]).array))[0])"
     fewer = script.replace("spp=8", "spp=1")
@@ -100,18 +100,6 @@ def test_the_script_writes_an_image_and_prints_the_gradients_shape(tmp_path):
     assert image.shape == (240, 640, 3)
     middle = image[110:170, 300:340]  # of the hydrant, which is red
     assert (middle[..., 0] > 2 * middle[..., 2]).mean() > 0.5
-
-
-def test_the_script_of_a_drive_changes_the_colours(tmp_path):
-    _, script = blocks("python")
-    assert len([line for line in script.splitlines() if line]) <= 25
-    short = script.replace("horizon=20", "horizon=4").replace("range(5)", "range(2)")
-    assert short.count("horizon=4") == short.count("range(2)") == 1
-    before = "before = params[key].numpy().copy()\nadam ="
-    after = "print(abs(adam[key].numpy() - before).max())\nprint(-value[0])"
-    *_, change, error = run(tmp_path, "-c", short.replace("adam =", before, 1) + after)
-    assert 0.05 <= float(change) <= 0.15  # two steps
-    assert float(error) >= 0
 
 
 @pytest.mark.usefixtures("variant")

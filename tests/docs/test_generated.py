@@ -9,6 +9,10 @@ import pytest
 
 from docs import generate
 from mi_nerfattack import plugins
+from mi_nerfattack.car.drive.config import DriveConfig
+from mi_nerfattack.car.drive.log import TOPICS
+from mi_nerfattack.car.drive.safety.judge import Cause
+from mi_nerfattack.car.vesc.calibration import Calibration
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGES = generate.pages()
@@ -33,6 +37,34 @@ def test_every_plugin_has_a_section_with_its_parts(name):
     assert f"](../pictures/plugin_{name}.jpg)" in section
     assert "| Parameter | Type | Description | Flags |" in section
     assert f'type="{name}"' in section and f'"type": "{name}"' in section
+
+
+def cells(section: str) -> dict[str, str]:
+    """Find the second cell of each row by the code spans of the first one."""
+    text = (DOCS / "car/reference.md").read_text("utf-8")
+    (found,) = re.findall(rf"^## {section}\n(.*?)(?=^##+ |\Z)", text, re.M | re.S)
+    rows = re.findall(r"^\| (.*?) \| (.*?) \|", found, re.M)
+    split = ((re.findall("`([^`]+)`", first), second) for first, second in rows)
+    return {name: second for names, second in split for name in names}
+
+
+@pytest.mark.parametrize(
+    ("section", "model"),
+    [("The drive file", DriveConfig), ("The calibration file", Calibration)],
+)
+def test_keys_of_the_car_are_listed_with_their_defaults(section, model):
+    listed = cells(section)
+    assert set(listed) == set(model.model_fields)
+    for name, field in model.model_fields.items():
+        if isinstance(field.default, float | int) and field.default is not False:
+            assert str(field.default).removesuffix(".0") in listed[name]
+
+
+def test_topics_and_causes_of_the_car_are_listed():
+    assert set(cells("Topics of the log")) == set(TOPICS)
+    rows = (DOCS / "car/safety.md").read_text("utf-8").partition("## What ends")[2]
+    listed = re.findall("`([^`]+)`", "".join(re.findall(r"^\|(.*?)\|", rows, re.M)))
+    assert sorted(listed) == sorted(cause.value for cause in Cause)
 
 
 @pytest.mark.parametrize("text", ["a link_\n\n.. _link: a.md", "|unknown|", "1. one"])

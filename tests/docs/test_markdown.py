@@ -31,7 +31,8 @@ def parse(text: str) -> list[Token]:
 def directives(text: str) -> Iterator[str]:
     """Find what a reader would see as code of another program."""
     for token in parse(text):
-        if token.type == "fence" and not re.fullmatch(r"\w*", token.info.strip()):
+        language = r"\w*|\{code-cell\} python"  # the latter of a notebook
+        if token.type == "fence" and not re.fullmatch(language, token.info.strip()):
             yield token.info
         if token.type != "inline":
             continue

@@ -1,16 +1,20 @@
-"""The JSON schemas for editors: equal to the models, and to what the reader takes."""
+"""Schemas and the page of the scenario file: equal to the models and their reader."""
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
 import pytest
+from pydantic_core import PydanticUndefined
 from support.files.runs import HEAD
 
 from docs import schema
 from mi_nerfattack.io.strict import parse_toml
+from mi_nerfattack.scenario import attack, objective, objects, scenario, vehicle
 from mi_nerfattack.scenario.scenario import Scenario
+from mi_nerfattack.scenario.section import NamedCameraSection, Section
 
 ROOT = Path(__file__).parents[2]
 SCHEMAS = {name: schema.schema(model) for name, model in schema.MODELS.items()}
@@ -39,6 +43,29 @@ RULES = {
 }
 NESTED = {"properties", "additionalProperties", "prefixItems", "items"}
 WORDS = {"default", "description", "$defs", "$schema"}
+#: Headings of docs/reference/scenario.md, and the models whose keys they list.
+LISTED: dict[str, list[type[Section]]] = {
+    "The scene": [scenario.SceneSection],
+    "Objects": [objects.FieldObjectSection],
+    "The camera": [NamedCameraSection],
+    "The drive": [scenario.DriveSection],
+    "The vehicle": [vehicle.DubinsSection],
+    "The attack": [attack.AttackSection],
+    "The search method": [
+        attack.GradientMethod,
+        attack.FrameMethod,
+        attack.RandomMethod,
+        attack.BlockMethod,
+        attack.EvolutionMethod,
+        attack.BayesianMethod,
+    ],
+    "What the attack may change": [attack.TextureFreedom, attack.PoseFreedom],
+    "Variation": [objective.VarySection],
+    "Sun and sky": [objective.SunSection],
+    "The baseline": [scenario.BaselineSection],
+}
+#: Keys that are tables with a section or page of their own, or belong to one model.
+ELSEWHERE = {"method", "freedom", "adjoint", "vary", "sun", "max_heading_rate"}
 
 
 def allows(rule, value, defs) -> bool:
@@ -116,3 +143,36 @@ def test_the_suffix_tells_the_kind_of_a_policy():
     for file, key in (("a.onnx", "recurrent = [[-1, 3]]"), ("a.py:A", "batch = 1")):
         text = HEAD.replace("policy.safetensors", file) + key
         assert is_valid("scenario", parse_toml("test", text))
+
+
+def listed(heading: str) -> set[tuple[str, str]]:
+    """Return keys and defaults (JSON) of a section of the page; nothing for words."""
+    page = (ROOT / "docs/reference/scenario.md").read_text("utf-8")
+    _, _, section = page.partition(f"# {heading}\n")
+    rows = re.findall(r"^\| `(\w+)` \| (.*?) \|", section.partition("\n#")[0], re.M)
+    return {
+        (key, json.dumps(json.loads(x[1:-1])) if x[0] == "`" else "") for key, x in rows
+    }
+
+
+def with_defaults(models: list[type[Section]]) -> set[tuple[str, str]]:
+    """Return keys and defaults (JSON) of models; nothing for none."""
+    found: set[tuple[str, str]] = set()
+    for model in models:
+        for key, default in model.defaults().items():
+            if key not in ELSEWHERE:
+                none = default in (None, (), PydanticUndefined)
+                found.add((key, "" if none else json.dumps(default)))
+    return found
+
+
+@pytest.mark.parametrize("heading", LISTED)
+def test_the_page_lists_every_key_and_default(heading):
+    kinds = {("kind", f'"{kind}"') for kind in ("gradient", "texture")} | {("kind", "")}
+    assert listed(heading) - kinds == with_defaults(LISTED[heading]) - kinds
+
+
+def test_the_page_lists_flat_objects():
+    common = with_defaults([objects.AbstractObjectSection]) | {("kind", "")}
+    flat = with_defaults([objects.FlatObjectSection]) - common
+    assert listed("Billboards and patches") == flat

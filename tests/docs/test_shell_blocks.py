@@ -11,6 +11,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from textwrap import dedent
 
 import pytest
 import tyro
@@ -21,28 +22,44 @@ from mi_nerfattack.commands import COMMANDS, each
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 RUN = {
+    "mi-nerfattack check scenes/demo.toml --no-drives -o check.png",
     "mi-nerfattack render frame scenes/intersection/field.xml -o hydrant.exr",
     "mi-nerfattack render frame scenes/intersection/field.xml -o hydrant.png \\",
     "mi-nerfattack render frame scenes/intersection/field.xml -o by_depth.exr \\",
     "mi-nerfattack render frame scenes/intersection/field.xml -o lit.png --sensor 1 "
     "--set relit=true",
+    "mi-nerfattack asset flat patch -o patch.safetensors --width-m 1.8 --height-m 4",
 }
 # Why the other blocks of a page are not run.
 INPUT = "takes files of the user's, or a folder that minutes to hours of work made"
 LONG = "takes more than a minute"
+CAR = "takes a run, a camera, a tracker or a car"
 USAGE = "shows what may be given, in words that stand for it"
 SKIPPED = {
-    **dict.fromkeys("README index howto/certify howto/policy".split(), LONG),
-    **dict.fromkeys("howto/training howto/your_policy".split(), LONG),
+    **dict.fromkeys("README index howto/certify howto/evaluate".split(), LONG),
+    **dict.fromkeys("howto/frames howto/training howto/your_policy".split(), LONG),
     **dict.fromkeys("reference/room results/bench results/refine".split(), LONG),
-    **dict.fromkeys("howto/attack howto/sweep".split(), USAGE),
+    **dict.fromkeys("howto/reproduce howto/sweep howto/sweep_cluster".split(), USAGE),
+    **dict.fromkeys("howto/attack howto/flat_objects howto/search".split(), INPUT),
+    **dict.fromkeys("howto/check howto/deployment".split(), INPUT),
+    **dict.fromkeys("howto/resume howto/vehicle".split(), INPUT),
     **dict.fromkeys("examples howto/fields howto/place".split(), INPUT),
+    **dict.fromkeys("howto/asset howto/bake howto/export".split(), INPUT),
+    **dict.fromkeys("howto/photographs howto/poses howto/splats".split(), INPUT),
+    "results/fields": INPUT,
     **dict.fromkeys("howto/render howto/report howto/retrain".split(), INPUT),
-    **dict.fromkeys("howto/transfer howto/view".split(), INPUT),
+    **dict.fromkeys("howto/transfer howto/view howto/policy".split(), INPUT),
+    "howto/retrain_code": INPUT,
+    **dict.fromkeys("howto/policy_steering howto/policy_url".split(), INPUT),
+    **dict.fromkeys("howto/conditions howto/openscenario".split(), INPUT),
+    **dict.fromkeys("howto/environments howto/mujoco".split(), LONG),
+    **dict.fromkeys("reference/places reference/routes".split(), LONG),
     **{f"results/{x}/README": INPUT for x in ("matrix", "methods", "table2")},
     "results/findings/index": LONG,
-    "car/index": "takes a run, a camera, a tracker or a car",
-    "howto/environments": "takes CARLA's server, or more than a minute",
+    **{f"car/{x}": CAR for x in "compare drive monitor motor overlay".split()},
+    **{f"car/{x}": CAR for x in "print remote setup".split()},
+    **dict.fromkeys("results/car results/retrain".split(), LONG),
+    "howto/carla": "takes CARLA's server",
     "reference/commands": "writes into the home folder",
     "start/first_attack": LONG,
     "start/install": "installs",
@@ -53,12 +70,13 @@ SKIPPED = {
 
 def blocks(page: Path, languages: tuple[str, ...] = ("",)) -> list[str]:
     """Find the blocks of a page that call us."""
-    fenced = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text("utf-8"), re.M | re.S)
+    fence = r"^( *)```(\w*)\n(.*?)^\1```$"  # indented in a list
+    fenced = re.findall(fence, page.read_text("utf-8"), re.M | re.S)
     ours = r"^(\S*/)?(mi-nerfattack|python -m|make|pip) "
     return [
-        text
-        for language, text in fenced
-        if language in languages and re.search(ours, text, re.M)
+        dedent(text)
+        for _, language, text in fenced
+        if language in languages and re.search(ours, dedent(text), re.M)
     ]
 
 

@@ -183,7 +183,7 @@ def test_sides_that_cannot_be_compared_are_refused(change, named):
 
 #: Share of the 95 % intervals that hold the mean, by how many values they are of: of
 #: values that are normal, lognormal, and mostly alike with one in ten that is ten times
-#: as large; the t interval on a logarithm, and BCa. docs/howto/report.md has it.
+#: as large; the t interval on a logarithm, and BCa. docs/explain/intervals.md has it.
 COVERAGE = {
     5: ((0.95, 0.85), (0.91, 0.77), (0.44, 0.40)),
     6: ((0.95, 0.86), (0.91, 0.81), (0.48, 0.46)),

@@ -198,13 +198,12 @@ def test_function_of_the_user(write):
 
 
 def test_examples_of_the_manual(write, tmp_path):
-    """The scenario and the function in docs/howto/attack.md work as written."""
-    manual = (Path(__file__).parents[2] / "docs/howto/attack.md").read_text("utf-8")
-    section = manual[manual.index("## The objective") :]
-    [toml] = re.findall(r"```toml\n(.*?)```", section, re.S)[:1]
+    """The scenario and the function in docs/howto/objective.md work as written."""
+    manual = (Path(__file__).parents[2] / "docs/howto/objective.md").read_text("utf-8")
+    [toml] = re.findall(r"```toml\n(.*?)```", manual, re.S)[:1]
     objective = build(write(toml))
     assert [weight for weight, _ in objective.terms] == [1.0, 0.1]
-    blocks = re.findall(r"```python\n(.*?)```", section, re.S)
+    blocks = re.findall(r"```python\n(.*?)```", manual, re.S)
     (tmp_path / "manual.py").write_text(blocks[0])
     objective = build(write(f'{FUNCTION}"manual.py:leave_to_the_right"'))
     state = dr.llvm.ad.Array3f64([0, 0], [1, -7], [0, 0])

@@ -17,12 +17,10 @@ from mi_nerfattack.scenario.scenario import load_scenario
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-GUIDE = Path(__file__).parents[2] / "docs/howto/policy.md"
-CHAPTER = (
-    GUIDE.read_text("utf-8").partition("\n## openpilot\n")[2].partition("\n## ")[0]
-)
-POLICY, CAMERAS = re.findall(r"(?s)```toml\n(.*?)```", CHAPTER)
-(SHOW,) = re.findall(r"(?s)```python\n(.*?)```", CHAPTER)
+GUIDE = Path(__file__).parents[2] / "docs/howto/policy_openpilot.md"
+TEXT = GUIDE.read_text("utf-8")
+POLICY, CAMERAS = re.findall(r"(?s)```toml\n(.*?)```", TEXT)
+(SHOW,) = re.findall(r"(?s)```python\n(.*?)```", TEXT)
 PAIR = Pair(hypotheses=5)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 import warnings
+from itertools import chain
 from pathlib import Path
 from types import SimpleNamespace
 from typing import get_args
@@ -29,23 +30,25 @@ from mi_nerfattack.scenario.scenario import load_scenario
 pytestmark = pytest.mark.usefixtures("variant")
 
 DOCS = Path(__file__).parents[2] / "docs"
-GUIDE = DOCS / "howto/policy.md"
+GUIDES = [*sorted((DOCS / "howto").glob("policy_*.md")), DOCS / "howto/your_policy.md"]
+CHAPTER = re.compile(r"(?m)\A# |^##+ ")  # not the comments in code
+REFERENCE = DOCS / "reference/policies.md"
 SCENARIO = HEAD.partition("[policy]")[0]
 
 
-def chapters(page=GUIDE):
-    """Yield the examples of a page: title, Python blocks, scenario text."""
-    text = page.read_text("utf-8")
-    for chapter in re.split(r"(?m)^##+ ", text)[1:]:
+def chapters():
+    """Yield the examples of the guides: title, Python blocks, scenario text."""
+    texts = [page.read_text("utf-8") for page in GUIDES]
+    for chapter in chain.from_iterable(map(CHAPTER.split, texts)):
         blocks = re.findall(r"(?s)```(\w+)\n(.*?)```", chapter)
         toml = [body for kind, body in blocks if kind == "toml"]
         title = chapter.partition("\n")[0]
-        if toml and title != "openpilot":  # it is run with the files that it needs
+        if toml and not title.startswith("openpilot"):  # test_openpilot has its files
             python = [body for kind, body in blocks if kind == "python"]
             yield pytest.param(python, toml[0], id=title)
 
 
-EXAMPLES = [*chapters(), *chapters(DOCS / "howto/your_policy.md")]
+EXAMPLES = list(chapters())
 
 
 def server_of_the_guide():
@@ -110,8 +113,8 @@ def test_examples_of_the_guide(blocks, toml, tmp_path, monkeypatch, served, rng)
             del sys.modules[name]
 
 
-def test_the_guide_lists_every_key():
-    text = GUIDE.read_text("utf-8")
+def test_the_reference_lists_every_key():
+    text = REFERENCE.read_text("utf-8")
     kinds = get_args(get_args(PolicySection)[0])
     for model in (*kinds, PreprocessSection):
         for key in model.defaults():

@@ -43,7 +43,7 @@ EXPERT, SCHEMES, RACECAR_J = "expert", ("http://", "https://"), "racecar-j"
 
 
 class DriveConfig(Section):
-    """A drive, all but its policy; docs/car/index.md has the keys in this order."""
+    """A drive, all but its policy; docs/car/reference.md lists the keys."""
 
     policy: str | None = None
     control_unit: Literal["rad", "rad/s"] = "rad"

@@ -18,7 +18,7 @@ _THOUSAND = 1000  # steps of the servo's range, as the controller takes them
 
 
 class Calibration(Section):
-    """Scales and limits of a car, see docs/car/index.md; defaults are a RACECAR/J's."""
+    """Scales and limits of a car (docs/car/reference.md); by default a RACECAR/J's."""
 
     erpm_per_ms: Annotated[float, Field(ge=100, le=100_000)] = 4614.0
     servo_per_rad: Annotated[float, Field(ge=-10, le=10)] = -1.2135
@@ -106,5 +106,5 @@ def write_calibration(path: str | Path, calibration: Calibration) -> None:
     """
     known = calibration.model_dump(exclude_none=True)
     lines = [f"{name} = {value!r}" for name, value in known.items()]
-    head = "# motor controller and steering servo of one car: docs/car/index.md"
+    head = "# motor controller and steering servo of one car: docs/car/reference.md"
     files.write_text(path, "\n".join([head, *lines, ""]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -147,18 +148,36 @@ def methods_of(summary: Figures) -> list[str]:
 
 
 def sections(summary: Figures, made: Figures) -> Iterator[str]:
-    """Yield flags, a table for each environment, and what the sweep was made of."""
-    flags = [f"- **{flag}".replace(": ", ":** ", 1) for flag in summary["flags"]]
-    flags += [f"- **failed:** {r['cell']}: {r['error']}" for r in summary["failed"]]
-    count = f"{summary['complete']} of {summary['cells']} attacks are complete."
-    yield "\n".join(["## Flags", "", count, *[""][: len(flags)], *flags])
+    """Yield a table for each environment, the flags, and what made the sweep."""
     compared = len(methods_of(summary)) > 1
-    header = ["route", "method", "frames", *CASES.values(), "attack to random"]
-    header += ["to the gradient"] if compared else []
+    header = ["route", "method", "frames", *CASES.values(), "out of the lane"]
+    header += ["attack to random", *["to the gradient"] * compared]
     for environment in dict.fromkeys(g["environment"] for g in summary["groups"]):
         rows = list(_rows(summary, environment, compared))
         yield f"## {environment}\n\n{markdown_table(header, rows)}"
+    yield "\n\n".join(_flags(summary))
     yield _provenance(summary, made)
+
+
+def _flags(summary: Figures) -> Iterator[str]:
+    """Yield a heading, how many attacks are complete, and one row per kind of flag."""
+    yield "## Flags"
+    yield f"{summary['complete']} of {summary['cells']} attacks are complete."
+    kinds: dict[str, list[str]] = {}
+    for flag in summary["flags"]:
+        kind, _, text = flag.partition(": ")
+        kinds.setdefault(kind, []).append(text)
+    for failed in summary["failed"]:
+        kinds.setdefault("failed", []).append(f"{failed['cell']}: {failed['error']}")
+    if kinds:
+        rows = [(kind, *_how_often(texts)) for kind, texts in kinds.items()]
+        yield markdown_table(["flag", "how often", "the first one"], rows)
+
+
+def _how_often(texts: Sequence[str]) -> tuple[str, str]:
+    """Return how often a flag is, and what its first one says."""
+    counted = re.match(r"in (\d+ of \d+ attacks); (.*)", texts[0])
+    return (counted[1], counted[2]) if counted else (str(len(texts)), texts[0])
 
 
 def _rows(
@@ -183,21 +202,23 @@ def _rows(
             route or "all",
             method,
             f"{attack['frames']:.0f}",
-            *(cell(groups.get((route, method, name))) for name in CASES),
+            *(cell(groups.get((route, method, name)), name) for name in CASES),
+            out(attack),
             *(ratio(effects.get((route, method, *other))) for other in others),
         )
 
 
-def cell(figures: Figures | None) -> str:
-    """Return mean, deviation, interval, attacks, and how many of them are out."""
+def cell(figures: Figures | None, case: str = ATTACK) -> str:
+    """Return the mean error, and with the attack its interval."""
     if figures is None:
         return ""
-    mean, count = f"{figures['cross_track_mean_m']:.3f}", figures["attacks"]
-    if figures["cross_track_sd_m"] is not None:
-        mean += f" ± {figures['cross_track_sd_m']:.3f}"
-    ends = interval(figures["cross_track_mean_ci95_m"])
-    out = f"{figures['attacks_out']}/{count} out"
-    return f"{mean}{ends} ({count}); {out}{percent(figures['attacks_out_rate_ci95'])}"
+    ends = interval(figures["cross_track_mean_ci95_m"]) if case == ATTACK else ""
+    return f"{figures['cross_track_mean_m']:.3f}{ends}"
+
+
+def out(figures: Figures) -> str:
+    """Return how many of the attacks put a wheel out of the lane for 1 s."""
+    return f"{figures['attacks_out']} of {figures['attacks']}"
 
 
 def interval(ends: Sequence[float] | None) -> str:
@@ -248,7 +269,7 @@ def settings(tuning: Figures, methods: Sequence[str]) -> str:
 
 
 def _provenance(summary: Figures, made: Figures) -> str:
-    """Tell what made the sweep, and the digests of what it was made of."""
+    """Return versions of programs, and digests of the files that the sweep used."""
     versions, contents = {}, {}
     for about in made.values():
         if about["versions"] is not None:
@@ -259,12 +280,12 @@ def _provenance(summary: Figures, made: Figures) -> str:
                 contents.setdefault(digest, key)
     attacks = summary["attacks"]
     done = sum(attack["converged"] for attack in attacks)
-    lines = [
-        *(f"- attacked with: {text}" for text in versions),
-        f"- {done} of {len(attacks)} attacks converged",
-        *(f"- {key}: SHA-256 {digest}" for digest, key in contents.items()),
+    rows = [
+        *(("attacked with", text) for text in versions),
+        ("converged", f"{done} of {len(attacks)} attacks"),
+        *((key, f"SHA-256 {digest}") for digest, key in contents.items()),
     ]
-    return "\n".join(["## What it was made of", "", *lines])
+    return f"## What it was made of\n\n{markdown_table(['what', 'which'], rows)}"
 
 
 def drives_of(document: Mapping[str, Any]) -> pd.DataFrame:
@@ -295,7 +316,7 @@ def transfer_sections(drives: pd.DataFrame) -> Iterator[str]:
     rows = list(cells.values())
     compare_rows(rows)
     columns = column_figures(rows, drives, _SEED)
-    header = ["condition", "no object", "attack", "ratio", "kept"]
+    header = ["condition", "no object", "attack", "out of the lane", "ratio", "kept"]
     others = {column["environment"] for column in columns} - set(ENVIRONMENTS)
     for environment in (*ENVIRONMENTS, *sorted(others)):
         own = [_column(c) for c in columns if c["environment"] == environment]
@@ -319,6 +340,7 @@ def _column(column: Mapping[str, Any]) -> Sequence[str]:
         column["condition"],
         f"{cases[NO_OBJECT]['cross_track_mean_m']:.3f}",
         cell(cases[ATTACK]),
+        out(cases[ATTACK]),
         "" if ratio is None else f"{ratio:.2f}",
         kept,
     )

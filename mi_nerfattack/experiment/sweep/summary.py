@@ -133,7 +133,7 @@ def read_attacks(
 def summarise(
     table: pd.DataFrame, attacks: Sequence[Mapping[str, Any]] = ()
 ) -> dict[str, Any]:
-    """Return what ``summary.json`` holds; docs/howto/sweep.md says what it means.
+    """Return what ``summary.json`` holds; docs/reference/sweep.md says what it means.
 
     Args:
         table: of the sweep.
@@ -233,7 +233,8 @@ def _noise(comparisons: Iterable[Mapping[str, Any]]) -> Iterator[str]:
         if row["other_case"] == RANDOM and row["route"] is not None:
             labels = (row[name] for name in ("route", "method", "budget"))
             where = " ".join(str(label) for label in labels if label is not None)
-            what = f"mean error in {row['environment']} over random looks, {where} (m)"
+            there = f"{row['environment']} over random textures"
+            what = f"mean error in {there}, {where} (m)"
             yield from noise_larger(Effect(**row["effect"]), what)
 
 

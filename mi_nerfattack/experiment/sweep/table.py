@@ -27,7 +27,7 @@ from mi_nerfattack.scenario.upgrade import upgraded_environment
 
 #: The table, and what its cells were made of.
 RESULTS, MADE_OF = "results.csv", "cells.json"
-#: Columns and their pandas types; docs/howto/sweep.md says what they mean.
+#: Columns and their pandas types; docs/reference/sweep.md says what they mean.
 COLUMNS = {
     "cell": TEXT,
     "route": TEXT,

@@ -54,7 +54,7 @@ class JoystickEnable(AbstractEnable):
     """A button of a joystick or gamepad by Linux's ``/dev/input/js0``.
 
     The driver tells changes alone: a wireless pad that is out of reach tells nothing,
-    and its button stays as it was. docs/car/index.md says which pads will do.
+    and its button stays as it was. docs/car/reference.md says which pads will do.
 
     Args:
         path: of the device.
