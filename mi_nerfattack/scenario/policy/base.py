@@ -161,7 +161,7 @@ def misfit(given: str | None, taken: str | None, source: str) -> str:
 
     Args:
         given: unit of the policy's control; None where nothing says it.
-        taken: unit of the vehicle's, likewise.
+        taken: unit of the vehicle's control; None where nothing says it.
         source: of the policy, for the message.
     """
     if None in (given, taken) or given == taken:
