@@ -70,10 +70,12 @@ _MACHINES = re.compile(
     r"\b(?:AMD|EPYC|Xeon|Ryzen|Threadripper|Intel Core|Core i\d|Graviton|Apple M\d"
     r"|[AHV][12]00|RTX \w+|GTX \w+|Tesla [A-Z]\d+)\b"
 )
-_RESULTS = tuple(
-    f"docs/results/{x}"
-    for x in "bench.md car.md fields.md retrain.md training.md".split()
-    + "table2/ methods/ matrix/".split()
+# Pages of results may name machines.
+_PAGES = "bench car fields gpu retrain training".split()
+_TABLES = "table2 methods matrix".split()
+_RESULTS = (
+    *(f"docs/results/{page}.md" for page in _PAGES),
+    *(f"docs/results/{table}/" for table in _TABLES),
 )
 
 _SENTENCE_END = re.compile(r"(?<!\.\.)[.!?][)\]\"'”’*]*\s+")
@@ -84,6 +86,9 @@ _ONLY_A_LINK = re.compile(
     rf"\s*(?:[-*] )?(?:{_ADDRESS}|!?\[[^\]]*\]\(\S+\)|\[!\[.*\]\(\S+\)"
     r"|<(?:img|a|source) [^>]*>)[.,;:]?\s*$"
 )
+# In docstrings: a name that a description follows, and a line of a simple table.
+_ARGUMENT = re.compile(r"(?<=^    )\w+(?=: )", re.M)
+_BORDER = re.compile(r"=+(?: +=+)+")
 
 
 @dataclass(frozen=True, order=True)
@@ -228,7 +233,20 @@ def docstrings(source: str) -> Iterator[Passage]:
         for expression in node.body:
             value = expression.value if isinstance(expression, ast.Expr) else None
             if isinstance(value, ast.Constant) and isinstance(value.value, str):
-                yield Passage(value.lineno, inspect.cleandoc(value.value), False)
+                text = _as_markdown(inspect.cleandoc(value.value))
+                yield Passage(value.lineno, text, False)
+
+
+def _as_markdown(docstring: str) -> str:
+    """Mark names of arguments as code, and simple tables as tables; keep the lines."""
+    lines, borders = _ARGUMENT.sub(r"`\g<0>`", docstring).split("\n"), 0
+    for index, line in enumerate(lines):
+        if _BORDER.fullmatch(line):
+            borders = (borders + 1) % 3
+            lines[index] = "|---|" if borders == 2 else ""
+        elif borders:
+            lines[index] = f"| {line} |"
+    return "\n".join(lines)
 
 
 def _public(

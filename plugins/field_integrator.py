@@ -136,7 +136,7 @@ class FieldIntegrator(FilmIntegrator):
     So is all that a nested ``prb``, ``prbvolpath`` or other differentiable integrator
     of Mitsuba's shows: BSDFs, bitmaps and lights, and fields that an emitter shares.
     In backward mode with respect to ``to_world`` of fields, and to the sensor where
-    fields are alone in the scene. AOVs are differentiated, too, but for the shares of
+    fields are alone in the scene. AOVs are differentiated, too, except the shares of
     single fields in ``interleaved``. What has no derivative raises an error: a nested
     integrator without that interface (``path``), moving surfaces, which occlude
     fields, and all but ``colour`` where a field is relit, whose light is constant.
@@ -240,7 +240,7 @@ class FieldIntegrator(FilmIntegrator):
         gains: Sequence[Gain] = (),
         **kwargs: Any,
     ) -> tuple[Any, mi.Bool, list[mi.Float], Any]:
-        """Integrate one ray a lane; see Mitsuba's ``RBIntegrator.sample``.
+        """Integrate one ray per lane; see Mitsuba's ``RBIntegrator.sample``.
 
         A film gives cotangents of :meth:`splats` as ``δsplats``, and finds tangents in
         the place of the state. ``width``: rays in a row of an image, if nothing is

@@ -21,12 +21,13 @@ class State:
     """What the primal pass of a ray hands to its derivatives.
 
     Attributes:
-        seen: the fields.
-        gains: light on them, as of `Rays`.
-        behind: (channels, n), what the nested integrator sees; None without one.
-        valid: (n,), whether it meets anything; likewise.
-        aovs: its AOVs.
-        inner: its own state.
+        seen: what the ray sees of the fields.
+        gains: light on the fields, as of `Rays`.
+        behind: (channels, n), what the nested integrator sees; None without a nested
+            integrator.
+        valid: (n,), whether the nested integrator meets anything; None without one.
+        aovs: AOVs of the nested integrator.
+        inner: state of the nested integrator.
     """
 
     seen: Seen

@@ -19,7 +19,7 @@ Mask: TypeAlias = "mi.Bool | bool"
 
 
 def read_filename(props: mi.Properties) -> str:
-    """Find the file that `filename` names: bundled, or beside the scene's."""
+    """Find the file that `filename` names: bundled, or in the scene's folder."""
     resolver = mi.file_resolver()  # pyright: ignore[reportCallIssue]  # no stub
     name: Any = props["filename"]
     return str(resolver.resolve(str(resolve(name))))

@@ -26,8 +26,9 @@ def concat(parts: Sequence[Any], counts: Sequence[int]) -> Any:
     """Lay arrays, or dataclasses and lists of arrays, end to end.
 
     Args:
-        parts: alike; an array may have one entry that stands for all of its part. What
-            is no array is the same in all parts.
+        parts: all of the same structure. An array may have a single entry, which then
+            counts for its whole part. A leaf that is not an array is equal in all
+            parts.
         counts: size of each part.
 
     Returns:
@@ -66,8 +67,8 @@ def put(target: Any, part: Any, place: mi.UInt32) -> None:
     """Scatter arrays, or dataclasses and lists of arrays, leaf by leaf.
 
     Args:
-        target: of arrays to scatter into.
-        part: likewise, to scatter.
+        target: arrays to scatter into.
+        part: arrays to scatter, in the structure of `target`.
         place: entry k goes to `place[k]`.
     """
     if isinstance(part, list):
@@ -199,7 +200,7 @@ def vjp(f: Callable[[Any], Any], x: Any, dy: Any) -> Any:
     Args:
         f: maps a PyTree of arrays to a PyTree of arrays.
         x: where to differentiate; itself stays detached or attached as it is.
-        dy: cotangent of ``f(x)``, of the same structure; a number stands for equal
+        dy: cotangent of ``f(x)``, of the same structure; a number is the value of all
             entries.
 
     Returns:

@@ -106,7 +106,7 @@ def noticed_interrupts() -> Iterator[None]:
     For code of others, which may save its state and return.
 
     Raises:
-        KeyboardInterrupt: one came, whatever the code made of it.
+        KeyboardInterrupt: Ctrl-C or SIGTERM came, even if the code has caught it.
     """
     came: list[int] = []
 

@@ -23,21 +23,22 @@ def view_gaps(
     points: np.ndarray,
     others: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Tell how far each view is from the next one that shows the same.
+    """Measure the angle from each view to the nearest view that shows the same points.
 
-    At a point, the angle between the rays of two views tells how much of what one shows
-    of its surroundings the other has seen, too. Of the points in a picture, the median
-    of the angles to the nearest other view that has the point in its picture; 180 where
-    none has, and for a view without points. Occlusion is left out.
+    The rays of two views to a point enclose an angle. The smaller this angle, the more
+    of the point's surroundings do both views show. For each point in a picture, the
+    function takes the smallest angle to another view with the point in its picture; it
+    takes 180 degrees where no other view has the point. The gap of a view is the median
+    over the points in its picture. Occlusion is not considered.
 
     Args:
         cameras: n intrinsics.
         camera_to_world: (n, 4, 4), OpenCV axes.
-        points: (m, 3), what the views show, sparse.
-        others: (n,), bool: the views to be near to; None for all.
+        points: (m, 3), sparse points that the views show.
+        others: (n,), bool: the views to measure the angle to; None for all.
 
     Returns:
-        (n,), degrees.
+        (n,), degrees; 180 for a view without points.
     """
     eyes = camera_to_world[:, :3, 3]
     shown = points_shown(cameras, camera_to_world, points)

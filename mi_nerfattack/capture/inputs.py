@@ -35,12 +35,17 @@ _POINTS_MARGIN = 0.1  # around the box of points and cameras, of its longest edg
 def read_depth(folder: str | Path, images: PosedImages) -> np.ndarray | None:
     """Read the depth maps that the transforms.json of a folder names.
 
-    Either ``depth_file``, our own: a safetensors file with the tensor ``depth``, a map
-    for each frame, metres along the ray; or nerfstudio's ``depth_file_path`` of each
-    frame, along the optical axis: whole millimetres as PNG of 16 bits or ``.npy``, or
-    metres as EXR or ``.npy`` of real numbers; unknown where it is 0 or less or NaN, and
-    without a surface beyond a million kilometres. A map may be larger or smaller than
-    its image; the nearest value is taken.
+    The JSON file names the depth maps by one of two keys:
+
+    - ``depth_file``, the key of this project, names a safetensors file. Its tensor
+      ``depth`` holds one map for each frame, in metres along the ray.
+    - ``depth_file_path`` of each frame, the key of nerfstudio, names a map of depths
+      along the optical axis. A PNG of 16 bits or a ``.npy`` of integers holds whole
+      millimetres; an EXR or a ``.npy`` of real numbers holds metres. A depth of 0 or
+      less, or NaN, is unknown. A depth over a million kilometres means that the ray
+      hits no surface.
+
+    A map may be larger or smaller than its image; each pixel takes the nearest value.
 
     Args:
         folder: the folder of `transforms.json`, or the JSON file; any other folder has
@@ -49,8 +54,8 @@ def read_depth(folder: str | Path, images: PosedImages) -> np.ndarray | None:
 
     Returns:
         n maps (height, width), float32, as `stacked` puts them together, metres along
-        the ray, infinite where nothing is hit and NaN where it is unknown; None if no
-        depth is named.
+        the ray: infinite where the ray hits nothing, NaN where the depth is unknown.
+        None if the JSON file names no depth.
 
     Raises:
         InputError: a file is missing or cannot be read, there is not a map for each

@@ -82,7 +82,7 @@ def render_asset(
     Returns:
         Images (RGBA, alpha from the geometry, not premultiplied), and depth (n_views,
         size_px, size_px), float32, metres along the ray to the first surface that is
-        at least half opaque, infinite beside the mesh.
+        at least half opaque. The depth is infinite where the ray misses the mesh.
     """
     if n_views < 1 or size_px < 1 or spp < 1:
         raise InputError(

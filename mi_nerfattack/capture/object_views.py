@@ -29,13 +29,13 @@ from mi_nerfattack.render.lighting.lights import Lighting
 
 @dataclass(frozen=True, eq=False)
 class ObjectViews:
-    """What an object's grid is fitted to.
+    """The views that an object's grid is fitted to.
 
     Attributes:
         images: RGBA.
         lower, upper: (3,), box of the object, metres.
-        depth: (n, height, width), metres along the ray, infinite beside the object;
-            None where it is not known.
+        depth: (n, height, width), metres along the ray, infinite where the ray misses
+            the object; None where the depth is not known.
     """
 
     images: PosedImages

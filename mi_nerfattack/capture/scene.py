@@ -55,13 +55,17 @@ def drive_poses(
 ) -> np.ndarray:
     """Scatter camera poses along routes, for fitting what a drive may see.
 
-    The routes take turns. A lane 3.5 m wide is surrounded by 1.5 m, others in
-    proportion. Arc length is uniform, 1.5 m beyond the ends of open routes too; lateral
-    offset normal with standard deviation 0.9 m, cut at the lane's edges, or for 40 % of
-    the poses uniform up to 1.5 m beside the lane; heading normal around the route's
-    with 15 degrees, or for 30 % uniform over all headings. Another 30 % sit at a height
-    uniform in 0.8 to 3 m, of a camera 1.4 m high and others in proportion, with the
-    pitch scattered by 6 degrees, the rest as mounted.
+    The routes take turns. The lengths below hold for a lane 3.5 m wide and a camera
+    1.4 m high; they grow in proportion to the lane's width and the camera's height.
+
+    - The arc length is uniform. On an open route it begins 1.5 m before the start and
+      ends 1.5 m after the end.
+    - The lateral offset is normal with standard deviation 0.9 m, cut at the lane's
+      edges. For 40 % of the poses it is uniform instead, up to 1.5 m outside the lane.
+    - The heading is normal around the route's heading with standard deviation 15
+      degrees. For 30 % of the poses it is uniform over all headings instead.
+    - The camera is as mounted. For 30 % of the poses its height is uniform from 0.8 to
+      3 m instead, and its pitch is normal with standard deviation 6 degrees.
 
     Args:
         routes: at least one.
@@ -153,8 +157,8 @@ def capture_scene(
 ) -> Path:
     """Write posed sRGB images of a driving scene, for fitting a field.
 
-    A view from where something stands between the camera and the lane's middle, as
-    within furniture, is drawn again.
+    Where a surface hides the lane's middle from the camera, for example where the
+    camera is within furniture, the view is drawn again.
 
     Writes `images/0000.png`..., `depth.safetensors` (tensor `depth`, (n, height,
     width), metres, see `View.depth`) and, last, `transforms.json`. Until then, each
@@ -176,8 +180,8 @@ def capture_scene(
 
     Raises:
         InputError: the scene has no integrator, no ground at z = 0 under a route, a
-            surface across one, or no free place for a view; or the folder holds views
-            of another call, whose differences are listed.
+            surface across a route, or no free place for a view. Also where the folder
+            holds views of another call; the message lists the differences.
     """
     require_colour()
     routes = load_routes(routes_path)

@@ -1,8 +1,8 @@
-"""What a car on the floor is made of, as the loop that drives it sees it.
+"""The devices of a car on the floor, as the loop that drives the car sees them.
 
-Every time is in seconds by one clock of this computer, :func:`time.monotonic` unless
-told otherwise: what a device says by a clock of its own is brought to it by the
-device's class. Nothing waits: a device keeps the newest it has, and the loop asks.
+Every time is in seconds by one clock of this computer, by default
+:func:`time.monotonic`. Where a device has another clock, the device's class converts
+the device's times. Nothing waits: a device keeps its newest value, and the loop asks.
 """
 
 from __future__ import annotations
@@ -174,10 +174,10 @@ class AbstractMotor(ABC):
 
     @abstractmethod
     def check(self) -> None:
-        """Check that the controller still brakes by itself as was proven.
+        """Check that the controller still brakes by itself, as `arm` has proved.
 
         Raises:
-            DeviceLostError: no answer, or it has started anew; arm it again.
+            DeviceLostError: no answer, or the controller has restarted; arm it again.
         """
 
     @abstractmethod
@@ -214,10 +214,10 @@ class AbstractMotor(ABC):
 
 
 class AbstractPilot(ABC):
-    """A policy that decides beside the loop, here or on another computer.
+    """A policy that decides while the loop runs, on this or on another computer.
 
     Both `submit` and `newest` raise `DeviceLostError` where the link is lost or the
-    policy failed, with its message.
+    policy failed, with the message of the failure.
     """
 
     @abstractmethod
@@ -245,7 +245,7 @@ class AbstractEnable(ABC):
 
     @abstractmethod
     def is_held(self) -> bool:
-        """Whether it is held at this moment; False, too, when it cannot be told."""
+        """Whether it is held at this moment; False, too, when that is unknown."""
 
     @abstractmethod
     def close(self) -> None:

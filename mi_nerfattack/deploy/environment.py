@@ -61,14 +61,15 @@ class CameraFrame:
         opacities of all layers add up to those of the frame.
 
         Args:
-            objects: names of those that are shown; not looked at where their geometry
-                is the scene's.
+            objects: names of the objects that are shown; ignored where the scene
+                contains their geometry.
 
         Returns:
-            by layer name: the frame as ``""`` (height, width, 4) and ``Z``; in the
-            same way ``scene`` and each object as ``NAME`` and ``NAME.Z``, and of the
-            surrogate further fields (``scene1``, ...) and what is seen behind all of
-            them (``background``). Linear; depths in metres along the ray.
+            by layer name: the frame as ``""`` (height, width, 4) and ``Z``. In the
+            same way ``scene``, and each object as ``NAME`` and ``NAME.Z``. The
+            surrogate adds its further fields (``scene1``, ...) and the background
+            behind all of them (``background``). Colours are linear, depths in metres
+            along the ray.
         """
         opaque = np.ones((*self.depth.shape, 1), np.float32)
         whole = {"": np.concatenate([self.light, opaque], axis=-1), "Z": self.depth}
@@ -232,7 +233,7 @@ class AbstractEnvironment(ABC):
 
     @abstractmethod
     def show(self, objects: Sequence[Any]) -> None:
-        """Show radiance fields in place of those shown before.
+        """Show radiance fields instead of the former ones.
 
         The surrogate composes them with its own field; other environments paste them
         by depth as opaque ones (appendix B.3). Frames change from the next one on.

@@ -27,26 +27,29 @@ _WORLD_M = 2 * LARGEST_M  # beyond what is driven from the farthest pose
 class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
     """Follow a route in a deployment environment.
 
-    Observation, a `Dict`: `image` (height, width, 3) uint8 sRGB; `depth` (height,
-    width) float32, metres along the ray, cut at 1000 m, which also stands for
-    nothing; `camera_to_world` (4, 4) float64, OpenCV axes, metres; `goal` (), the
-    route's goal.
+    Observation, a `Dict`:
+
+    - `image`: (height, width, 3) uint8, sRGB.
+    - `depth`: (height, width) float32, metres along the ray, at most 1000 m. Where the
+      ray hits nothing, the depth is 1000 m, too.
+    - `camera_to_world`: (4, 4) float64, OpenCV axes, metres.
+    - `goal`: (), the route's goal.
 
     Action: `Box` (k,) float32 from -1 to 1, one number for each of the k controls of
     `environment.control_names`. The first is the share of `environment.max_control`, in
-    `environment.control_unit`; positive steers to the left. The others are shares of
-    the highest value of the control, or where they are negative of the lowest.
+    `environment.control_unit`; positive steers to the left. A positive number for
+    another control is a share of its highest value, a negative one of its lowest.
 
-    Reward: 1 in the lane's centre after the step, falling evenly to 0 where the
-    vehicle's side passes the lane's border, so that a step in the lane is always worth
-    more than none. There the vehicle leaves the lane, and an episode terminates; it is
-    truncated at the end of the route, after `max_steps` steps, or where the environment
-    has nothing more to observe.
+    Reward: 1 where the vehicle is in the lane's centre after the step. The reward falls
+    linearly to 0 where the vehicle's side passes the lane's border. So a step in the
+    lane is always worth more than no step. Beyond the border the vehicle has left the
+    lane, and the episode terminates. The episode is truncated at the end of the route,
+    after `max_steps` steps, or where the environment has nothing more to observe.
 
     `info` holds `cross_track_m`, `arc_length_m`, `state` and, in a reset, `route`.
     Options of `reset`: `route`, the name of one of the routes; `pose`, (3,) x, y and
-    heading. Without the first, the seed draws a route; without the second, the
-    episode begins at the route's start.
+    heading. Without `route`, the seed draws a route; without `pose`, the episode
+    begins at the route's start.
 
     Args:
         environment: what is driven; it is closed with this one.

@@ -71,7 +71,7 @@ class Place:
         field: the scene's field, of the surrogate; None where there is none.
         field_pose: field to world; None where they are the same.
         routes: JSON.
-        objects: grid fields that may stand beside the road.
+        objects: grid fields that may stand at the roadside.
         camera: of the vehicle; the first one, if it has several.
         mount: where the camera sits on it.
         period: seconds between two images.

@@ -1,4 +1,4 @@
-"""Where driving frames come from: environments of a place, conditions drawn anew."""
+"""Where driving frames come from: environments of a place, in drawn conditions."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ CARLA = "carla"
 
 @dataclass(frozen=True)
 class Weather:
-    """Conditions that are drawn anew for every shard of frames.
+    """Conditions of which every shard of frames gets a new draw.
 
     Args:
         skies: times of day, equally likely.
@@ -109,10 +109,10 @@ class AbstractSite(ABC):
 
     @abstractmethod
     def load_objects(self, least: int = 1) -> list[GridField]:
-        """Load the fields that stand beside the road; may be empty.
+        """Load the fields that stand at the roadside; may be empty.
 
         Args:
-            least: number of fields, each with a texture of its own; where the site has
+            least: number of fields, each with a separate texture; where the site has
                 fewer objects, some come several times.
         """
 
@@ -244,7 +244,10 @@ def expert_of(site: AbstractSite, route: Route) -> AbstractExpert:
 
 
 def probe_expert(site: AbstractSite, route: Route) -> list[float]:
-    """Return an expert's steering beside a route's middle: it tells experts apart."""
+    """Return an expert's steering at three poses near a route's middle.
+
+    The values identify the expert: other experts steer differently there.
+    """
     expert, controls = expert_of(site, route), []
     for lateral, heading in ((0.1, 0.0), (-0.2, 0.05), (0.0, -0.1)):
         state = route.pose_at(route.length / 2, lateral, heading)

@@ -270,8 +270,8 @@ def check_bricks(
     Args:
         bricks: number of occupied cells.
         subdivisions: see :class:`BrickField`.
-        vertices: likewise.
-        sky: likewise.
+        vertices: see :class:`BrickField`.
+        sky: see :class:`BrickField`.
     """
     if not bricks:
         raise InputError("occupancy: no cell is occupied; at least one has a brick")

@@ -194,10 +194,9 @@ class GridField(AbstractField):
 
     @contextmanager
     def one_level(self, level: GridLevel) -> Iterator[None]:
-        """Evaluate the field as one level in place of all; see `OneLevel`.
+        """Evaluate the field as one level instead of all levels; see `OneLevel`.
 
-        Meanwhile there are derivatives by the colours of one level, and by nothing else
-        of the field.
+        Meanwhile the field has derivatives by the colours of this level only.
 
         Args:
             level: one of :meth:`levels`.
@@ -277,7 +276,7 @@ class GridField(AbstractField):
 
         Args:
             unit: (3, n) in the unit cube.
-            texture: (3 n_vertices,) raw colours, in place of the field's.
+            texture: (3 n_vertices,) raw colours, used instead of the field's colours.
 
         Returns:
             density, red, green and blue, raw, (n,) each.
@@ -320,7 +319,7 @@ class GridField(AbstractField):
     def density_bound(self) -> float:
         """Return the largest density in occupied cells before the window's factor.
 
-        Exact but for rounding. Kept until the density or the occupancy changes, since
+        Exact except for rounding. Kept until density or occupancy changes, because
         media ask for it after every change of a parameter.
         """
         if self._bound is None:

@@ -148,7 +148,7 @@ def largest_sum(
         cells: boolean (rx, ry, rz), the occupied ones.
 
     Returns:
-        the largest sum, exact but for rounding; minus infinity without such a cell.
+        the largest sum, exact except for rounding; minus infinity without such a cell.
     """
     finest = levels[-1].resolution - 1
     blocks = cells.T  # z first, as vertices lie

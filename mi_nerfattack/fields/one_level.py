@@ -131,7 +131,7 @@ class OneLevel:
         """Yield which vertices of `level` the lattice's points lie between, and how."""
         side = self.level.resolution
         place = self._points * self.level.scale
-        # A point that lies on a vertex but for rounding has this one alone
+        # A point that lies on a vertex except for rounding has this one alone
         nearest = dr.round(place)
         place = dr.select(dr.abs(place - nearest) < 1e-3, nearest, place)
         cell = dr.minimum(dr.floor(place), side - 2)

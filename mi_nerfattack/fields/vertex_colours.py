@@ -28,9 +28,9 @@ _MARGIN = (
 class VertexColours:
     """The sRGB colours c of the vertices of a grid field's finest level.
 
-    A grid field's colour is the sigmoid of a sum over levels, so that equal steps on
-    all of them add up, and colours far out on the sigmoid hardly move any more. Steps
-    in c do neither. With the texture's own colours c0::
+    A grid field's colour is the sigmoid of a sum over levels. So equal steps on all
+    levels add up, and colours far out on the sigmoid hardly move any more. Steps in c
+    have neither effect. Let c0 be the colours that the texture gives. Then::
 
         raw(finest level) = raw(finest level of the texture) + logit(c) - logit(c0)
 

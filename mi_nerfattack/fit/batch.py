@@ -101,7 +101,7 @@ class BatchSource:
         """Draw rays.
 
         Args:
-            random: `mi.PCG32`, one stream a ray; it is advanced.
+            random: `mi.PCG32`, one stream per ray; it is advanced.
             limit: rays in use; the rest is inactive.
         """
         index = self.bank.draw(random)

@@ -30,7 +30,7 @@ _MAX_SHARE = 0.02  # of the time that may go into writing
 
 
 class FitRecord(Record):
-    """What is kept beside the state: wall time, and reports so far."""
+    """Values that a checkpoint keeps with the state: wall time, and reports so far."""
 
     elapsed_s: float
     history: list[FitProgress]
@@ -40,9 +40,9 @@ class FitCheckpoint:
     """Keeps the state of a fit on disk.
 
     Args:
-        path: file, replaced atomically; if it is there, the fit goes on from it.
+        path: file, replaced atomically; if the file exists, the fit goes on from it.
         training: the fit.
-        anew: it does not.
+        anew: start the fit from its beginning even if the file exists.
 
     Attributes:
         elapsed_s: wall time of the fit before it was interrupted.

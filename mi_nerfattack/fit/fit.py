@@ -53,8 +53,8 @@ def fit_ngp(
     """Fit an NGP with a sky to images of a scene.
 
     Args:
-        images: RGB, or RGBA: then, as with `FitOptions.sky` off, a random colour lies
-            behind each ray in place of the sky, which stays black.
+        images: RGB or RGBA. With RGBA, as with `FitOptions.sky` off, a random colour
+            lies behind each ray instead of the sky, which stays black.
         lower: corner of the field's box, metres; what lies outside becomes sky.
         upper: opposite corner, metres.
         layout: None for Instant-NGP's: 16 levels of 2^19, width 64. `NGPLayout.small()`
@@ -116,10 +116,11 @@ def fit_grid(
         upper: opposite corner, metres.
         layout: None for 16 levels from 16 to 64.
         options: None for the defaults.
-        depth: (n, height, width), metres along the ray, infinite beside the object.
+        depth: (n, height, width), metres along the ray, infinite where the ray misses
+            the object.
         progress: as of `fit_ngp`.
-        checkpoint: likewise.
-        anew: likewise.
+        checkpoint: as of `fit_ngp`.
+        anew: as of `fit_ngp`.
 
     Returns:
         the field, and its scores on the held-out images.
@@ -155,8 +156,8 @@ def fit_object(
         resolution: of the finest level.
         options: of the fit.
         progress: as of `fit_ngp`.
-        checkpoint: likewise.
-        anew: likewise.
+        checkpoint: as of `fit_ngp`.
+        anew: as of `fit_ngp`.
     """
     # room for the outermost vertices' own cells
     room = 2.0 / resolution * float((views.upper - views.lower).max())

@@ -54,10 +54,11 @@ def loss_and_cotangent(
 ) -> tuple[Any, Any, March]:
     """Compare a march with the images.
 
-    Per ray, the mean over channels of the Huber loss between sRGB values, plus, where
-    the batch has depths, the Huber loss of relative error of the depth moment (for
-    rays that hit something) and of opacity; neither where depth is NaN, unknown.
-    Derivatives reach `background` and `gain` through Dr.Jit's graph.
+    The loss of a ray is the mean over channels of the Huber loss between sRGB values.
+    Where the batch has depths, two Huber losses are added: of the opacity, and, for
+    rays that hit something, of the relative error of the depth moment. Neither is added
+    where the depth is NaN, because it is unknown there. Derivatives reach `background`
+    and `gain` through Dr.Jit's graph.
 
     Args:
         primal: of the batch's rays, detached.

@@ -124,10 +124,11 @@ def seen_cells(
 ) -> np.ndarray:
     """Mark the cells of a grid over a box that several cameras look at.
 
-    What a single camera sees can be given any depth, and what none sees any colour:
-    density there would only hide the rest from other views. So it would close before a
-    camera, where a fit begins with fog that is thrown away slowly, if at all: where
-    sparse points tell how near to a camera things begin, cells between are left out.
+    A fit may give any depth to the part of the scene that a single camera sees, and any
+    colour to the part that no camera sees. Density there would only hide the rest of
+    the scene from other views. The same holds for cells close to a camera: a fit begins
+    with fog there, which vanishes slowly, if at all. Where sparse points show how far
+    from a camera the scene begins, the cells in between are not marked.
 
     Args:
         images: the posed images.

@@ -91,8 +91,9 @@ class FitProgress:
         psnr_db: of the last batches, sRGB.
         elapsed_s: wall time.
         occupied: share of cells that are marched through.
-        rays: of a step, mean over the last steps.
-        samples: of a step that light reaches the eye from, likewise.
+        rays: rays in a step, mean over the last steps.
+        samples: samples in a step that light reaches the eye from, mean over the last
+            steps.
     """
 
     step: int

@@ -113,7 +113,7 @@ class FieldRenderer:
 
     Args:
         field: the field, or one at a pose in the cameras' world.
-        over_white: put white behind it in place of its own background.
+        over_white: put white behind the field instead of its background.
     """
 
     def __init__(

@@ -80,9 +80,9 @@ def read_layers(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]
     """Read what `write_layers` wrote, or any single-part flat EXR file.
 
     Returns:
-        The layers as float32, named and shaped as for `write_layers` (a layer's R, G,
-        B and, where present, A together as (H, W, 3 or 4), any other channel alone
-        as (H, W)), and the file's string attributes.
+        The layers as float32, named and shaped as for `write_layers`, and the file's
+        string attributes. A layer's R, G, B and, where present, A together are (H, W,
+        3 or 4); any other channel alone is (H, W).
 
     Raises:
         InputError: for a missing, foreign, truncated, deep, multi-part or subsampled

@@ -282,7 +282,7 @@ def make_folder(path: str | Path) -> Path:
 def check_writable(path: str | Path) -> None:
     """Raise InputError if a file could not be written to a path.
 
-    To be called before long work; it makes a file beside the target and removes it.
+    Call it before long work; it makes a file in the target's folder and removes it.
     """
     with reported(path):
         target = Path(os.path.realpath(path))

@@ -10,15 +10,16 @@ from mi_nerfattack.io import files
 
 
 class GrowingFile:
-    """What is written is in the system's hands at once: a killed process loses nothing.
+    """A file that hands its data to the system at once: a killed process loses none.
 
-    Unlike all other files it is not written beside its target first.
+    Unlike all other files, it is written under its name from the start, not first
+    under a temporary name.
 
     Args:
-        path: of no file; its folder is made.
+        path: where no file exists yet; its folder is made.
 
     Raises:
-        InputError: it exists, or cannot be made or written.
+        InputError: the file exists, or cannot be made or written.
     """
 
     def __init__(self, path: str | Path) -> None:

@@ -94,14 +94,14 @@ def tell(
     found: Iterable[tuple[Sequence[str | int], str]],
     settings: Sequence[str] = (),
 ) -> str:
-    """Tell problems of a file, each with its line and key; of many, the first.
+    """Describe the problems of a file, each with its line and key; of many, the first.
 
     Args:
         path: the file.
         text: its content, valid TOML.
         found: keys that lead to each problem, and what is wrong.
-        settings: of the command line, see :func:`set_keys`; a problem of one of
-            them is told with the setting in place of a line.
+        settings: of the command line, see :func:`set_keys`; the description of a
+            problem with a setting names the setting instead of a line.
     """
     found, lines = list(found), []
     for location, problem in found[:_MOST_PROBLEMS]:

@@ -1,9 +1,9 @@
 """Work that is done, kept in files that an interrupted job goes on from.
 
 A unit of work is one safetensors file, written whole or not at all and never changed
-in part. Its metadata hold the *identity* of the unit (its format, versions and all
-values that decide its result, each under a key of its own), a record that decides
-nothing, and a checksum of the tensors.
+in part. Its metadata hold the *identity* of the unit, a record that decides nothing,
+and a checksum of the tensors. The identity is the format, the versions and all values
+that decide the unit's result, each under a separate key.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _NONE = "(none)"
 
 
 class Record(pydantic.BaseModel):
-    """What is kept beside tensors; written and read as JSON."""
+    """Values that a file keeps in addition to tensors; written and read as JSON."""
 
     model_config = pydantic.ConfigDict(
         extra="forbid", frozen=True, strict=True, ser_json_inf_nan="constants"
@@ -56,11 +56,11 @@ R = TypeVar("R", bound=Record)
 
 @dataclass(frozen=True, eq=False)
 class Kept(Generic[R]):
-    """What a file held.
+    """The content of a unit's file.
 
     Attributes:
-        tensors: by name.
-        record: likewise of the unit.
+        tensors: tensors of the unit, by name.
+        record: record of the unit.
         ignored: differences that were ignored, one line each.
     """
 
@@ -162,8 +162,9 @@ def check_entries(
 
     Args:
         path: their file.
-        found: by name; others than the needed ones are left alone.
-        needed: likewise; of an empty one the first axis is free.
+        found: tensors of the file, by name; those that are not needed are ignored.
+        needed: examples of the needed tensors, by name; where an example is empty, the
+            first axis may have any length.
     """
     for name, like in needed.items():
         value, free = found.get(name), 0 if like.size else 1
@@ -221,8 +222,8 @@ def flatten(name: str, value: Any) -> dict[str, str]:
 def differences(kept: Mapping[str, str], present: Mapping[str, str]) -> list[str]:
     """Compare two identities.
 
-    A value that is JSON with a key ``sha256`` stands for a file: only its content
-    counts.
+    A value that is JSON with the keys ``file`` and ``sha256`` describes a file: only
+    the file's content counts.
 
     Returns:
         a line for each key whose values differ: ``key: kept -> present``.
@@ -246,7 +247,7 @@ def _difference(key: str, kept: str | None, present: Mapping[str, str]) -> str:
 
 
 def content_of(value: str) -> str:
-    """Return the SHA-256 of a value that stands for a file; any other value itself."""
+    """Return the SHA-256 in a value that describes a file; any other value itself."""
     entry = _as_file(value)
     return value if entry is None else entry["sha256"]
 

@@ -21,11 +21,11 @@ _NEAR_M = 0.1
 class Trajectory:
     """Follow positions over time: pure pursuit, and a law for the speed.
 
-    The vehicle steers at the point that lies the look-ahead ``L = max(look_ahead_m,
-    look_ahead_s v)`` along the path, not before the first position, nor beyond the
-    last. For a point x forward and y to the left, the curvature is
+    The vehicle steers at a point on the path. This point lies at the distance
+    ``L = max(look_ahead_m, look_ahead_s v)``, but not before the first position, nor
+    beyond the last. For a point x forward and y to the left, the curvature is
     ``2 y / (x^2 + y^2)``. The acceleration is ``speed_gain (w - v)``, with w the mean
-    speed along the path until `speed_s`. Both are differentiable, but where the path
+    speed along the path until `speed_s`. Both are differentiable, except where the path
     bends or ends.
 
     Source: Coulter 1992, Implementation of the pure pursuit path tracking algorithm.

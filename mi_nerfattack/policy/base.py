@@ -17,13 +17,13 @@ Memory = tuple[Any, ...]
 @dataclass(frozen=True)
 @checked("numbers")
 class Numbers:
-    """What a policy is told besides images and goal: columns of one tensor (n, k).
+    """Numbers that a policy gets besides images and goal: columns of a tensor (n, k).
 
     Args:
         speed: one column, metres per second along the heading.
         route_m: arc lengths, metres, from the route's point nearest to the vehicle to
-            points ahead; of each the coordinates forward and to the left of the
-            vehicle, metres: x1, y1, x2, y2, ...
+            points ahead. Each point has two columns: its coordinates forward and to the
+            left of the vehicle, metres (x1, y1, x2, y2, ...).
         time: one column, seconds since the start of the drive.
     """
 
@@ -65,7 +65,7 @@ class AbstractPolicy(ABC):
 
     Attributes:
         differentiable: whether derivatives exist; gradient methods refuse others.
-        numbers: what the policy is told besides images and goal.
+        numbers: the numbers that the policy gets besides images and goal.
     """
 
     differentiable: ClassVar[bool] = True
@@ -105,26 +105,27 @@ class AbstractPolicy(ABC):
         """Multiply cotangents by the derivative of `step`.
 
         Args:
-            image: as given to `step`; of a policy without memory, images of several
-                steps one after the other: each row of a batch stands for itself.
+            image: as given to `step`. A policy without memory may get the images of
+                several steps, one after the other, because the rows of a batch do not
+                depend on each other.
             goal: as given to `step`.
-            memory: likewise.
+            memory: as given to `step`.
             cotangent: derivative of the objective by the control, of its shape.
             d_memory: derivative of the objective by the memory that `step`
                 returned, of its structure; ``()`` after the last step.
             numbers: as given to `step`.
 
         Returns:
-            Derivatives of the objective by the image, by `memory` and by `numbers`,
-            which is None where those are.
+            Derivatives of the objective by the image, by `memory` and by `numbers`;
+            the last one is None where `numbers` is None.
         """
         del memory, d_memory, numbers
         return self.vjp(image, goal, cotangent)[1], (), None
 
     def planes(self, image: Any, memory: Memory) -> np.ndarray:
-        """Return what `step` makes of images before it looks at them.
+        """Return the planes that `step` makes of images before the network sees them.
 
-        The images themselves, unless a policy tells more.
+        These are the images themselves, unless a policy overrides this method.
 
         Args:
             image: as for `control`.

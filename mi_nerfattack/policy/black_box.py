@@ -24,13 +24,13 @@ class AbstractBlackBox(AbstractPolicy):
     """Policy that only answers: no gradient method takes it.
 
     Its memory is the number of images before this one, and the frame stack of each
-    camera. A policy that keeps more than that itself starts anew where that number
+    camera. A policy that keeps a further memory itself clears it where this number
     is 0.
 
     Args:
         preprocess: from the camera's image to the policy's.
-        action: what the answer means; by default it is the control.
-        inputs: what the policy is given.
+        action: meaning of the answer; by default the answer is the control.
+        inputs: the inputs of the policy.
         name: for messages.
     """
 
@@ -56,8 +56,8 @@ class AbstractBlackBox(AbstractPolicy):
         """Ask the policy.
 
         Args:
-            given: by name; images as the pre-processing gives them, float32,
-                (n, c, h, w) by default, and what else the policy is told.
+            given: inputs by name: images as the pre-processing gives them, float32,
+                (n, c, h, w) by default, and the numbers that the policy asks for.
             goals: (n,) int64.
             step: number of images before these in the drive.
 

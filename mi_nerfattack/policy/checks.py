@@ -179,8 +179,9 @@ def check_repeatable(
 ) -> None:
     """Refuse a module that answers the same image twice differently.
 
-    The loop evaluates a control period anew for its derivative, and begins every
-    drive with the same module. Buffers that change betray what no answer shows yet.
+    The loop evaluates a control period again for its derivative, and begins every drive
+    with the same module. A buffer that has changed shows that a later answer may
+    differ, even if no answer has differed yet.
 
     Args:
         module: the module; `PilotNet` is known to be repeatable.

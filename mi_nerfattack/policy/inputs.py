@@ -1,4 +1,4 @@
-"""What a network is given, in which order, and how it is told the goal."""
+"""The inputs of a network, their order, and the form in which it gets the goal."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Inputs:
     Args:
         names: of cameras, of numbers ("speed", (n, 1); "route", (n, k, 2), forward and
             left; "time", (n, 1)), and "goal". Left out, the images and the goal.
-        numbers: what the closed loop tells; the action may need more than the network.
+        numbers: what the closed loop gives; the action may need more than the network.
         views: rows and columns of each camera's image in the frame, by its name; left
             out, the frame is the only image.
 

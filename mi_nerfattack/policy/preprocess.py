@@ -34,10 +34,10 @@ class Crop(AbstractTransform):
     """Cut margins off.
 
     Args:
-        top: rows that go; the others likewise.
-        bottom: rows.
-        left: columns.
-        right: columns.
+        top: rows to cut off.
+        bottom: rows to cut off.
+        left: columns to cut off.
+        right: columns to cut off.
     """
 
     def __init__(self, top: int, bottom: int, left: int, right: int) -> None:
@@ -56,10 +56,10 @@ class FractionalCrop(AbstractTransform):
     Rows and columns are rounded to whole ones, halves up.
 
     Args:
-        top: part of the height in [0, 1); the others likewise.
-        bottom: part of the height.
-        left: part of the width.
-        right: part of the width.
+        top: part of the height to cut off, in [0, 1).
+        bottom: part of the height to cut off, in [0, 1).
+        left: part of the width to cut off, in [0, 1).
+        right: part of the width to cut off, in [0, 1).
     """
 
     def __init__(self, top: float, bottom: float, left: float, right: float) -> None:
@@ -172,7 +172,7 @@ class ColourMatrix(AbstractTransform):
 
     Args:
         matrix: A, rows of three numbers.
-        offset: b, a number a row.
+        offset: b, one number per row.
     """
 
     def __init__(
@@ -215,8 +215,8 @@ class Normalise(AbstractTransform):
 
     Args:
         scale: 255 for networks that were trained on bytes.
-        mean: one number, or one a channel, in the scaled unit.
-        std: likewise, positive.
+        mean: one number, or one per channel, in the scaled unit.
+        std: one positive number, or one per channel, in the scaled unit.
     """
 
     def __init__(
@@ -280,9 +280,9 @@ class Preprocess:
 
     Args:
         transforms: applied to each camera image.
-        frames: length k of the stack: the image, and those `stride`, ...,
-            (k - 1) `stride` control periods ago. Before there are so many, the first
-            image stands for them.
+        frames: length k of the stack: the image, and the images `stride`, ...,
+            (k - 1) `stride` control periods ago. The first image replaces the images
+            from before the start of the drive.
         stride: control periods between two frames of the stack.
         layout: of the network's input, oldest frame first.
     """
@@ -355,10 +355,11 @@ class Preprocess:
 
         Args:
             planes: as for `stack`.
-            past: likewise.
+            past: as for `stack`.
 
         Returns:
-            Those of the stack, and all that are known: (n, t, c, h, w), oldest first.
+            The frames of the stack, and all known frames, (n, t, c, h, w), oldest
+            first.
         """
         known = planes[:, None]
         if past.shape[1]:

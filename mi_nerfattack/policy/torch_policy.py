@@ -41,8 +41,8 @@ def call_module(
 
     The camera's image is a view of memory that the loop reads again, and has the
     strides of (n, h, w, 3). A foreign network may write into its input, or view it
-    as the contiguous array of its training, so that it gets copies; `PilotNet` does
-    neither, and convolves the view as it is.
+    as the contiguous array of its training, so it gets copies. `PilotNet` does neither,
+    and convolves the view without a copy.
 
     Args:
         module: is called as ``module(*arguments)``.
@@ -53,8 +53,8 @@ def call_module(
         The control and the hidden states.
 
     Raises:
-        InputError: the module takes images of another shape, which is told, raises an
-            exception, or returns something else than tensors.
+        InputError: the module raises an exception, or returns something else than
+            tensors. If it takes images of another shape, the message names the shape.
     """
     try:
         if isinstance(module, PilotNet):
@@ -96,20 +96,21 @@ _PLAIN = torch.contiguous_format
 class TorchPolicy(AbstractPolicy):
     """Policy given by a torch module; memory is shared, not copied, both ways.
 
-    The module is called as ``module(image, *goal, *hidden)``, or with what `inputs`
-    says before the hidden states, and returns the control, or a tuple of the control
-    and the hidden states for the next image. It keeps no state in itself; the very
-    first image is evaluated twice to see that. The memory is the frame stack of each
-    image, where there is one, and the hidden states.
+    The module is called as ``module(image, *goal, *hidden)``, or with the inputs that
+    `inputs` names before the hidden states. It returns the control, or a tuple of the
+    control and the hidden states for the next image. The module keeps no state in
+    itself; the policy evaluates the very first image twice to check that. The memory is
+    the frame stack of each image, where there is one, and the hidden states.
 
     Args:
-        module: takes what `preprocess` and `goal` make of the camera's image, (n, 3,
-            height, width), sRGB in [0, 1], unless told otherwise, and gives controls
-            (n,), (n, 1), or (n, k) where `output` tells the column. It is switched to
-            evaluation mode, its parameters are frozen, and it is moved to the device
-            of the images.
-        goal: how the goal is passed; by default ``IntegerGoal(module.goals)`` if the
-            module has this attribute, otherwise `NoGoal()`.
+        module: takes the image as `preprocess` gives it, by default (n, 3, height,
+            width), sRGB in [0, 1], and the goal as `goal` gives it. It returns numbers
+            (n,), (n, 1) or (n, k), of which `action` makes the control. The policy
+            switches it to evaluation mode, freezes its parameters and moves it to the
+            device of the images.
+        goal: form in which the module gets the goal; by default
+            ``IntegerGoal(module.goals)`` if the module has this attribute, otherwise
+            `NoGoal()`.
         preprocess: from the camera's image to the network's.
         recurrent: shapes of the hidden states, zero at first, with -1 for the number
             of vehicles: ``[(-1, 64)]``, ``[(1, -1, 32)]``.

@@ -129,7 +129,7 @@ class AttackedBox:
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """From where the run's drives in the surrogate, past the attack, saw it.
+    """The camera's poses in a run's drives in the surrogate, with the attacked objects.
 
     Attributes:
         camera: intrinsics.

@@ -87,10 +87,10 @@ def seen_faces(
         eye: (3,), of the camera, metres.
 
     Returns:
-        by the names of the faces that are seen, which never hide each other: (3, 3),
-        from (u, v, 1), 0 to 1 across and down the face's picture, to pixels (x, y, 1)
-        times a number that is positive before the eye. Empty for an eye behind the
-        monitor.
+        by the names of the faces that are seen: matrices (3, 3). A matrix maps
+        (u, v, 1), from 0 to 1 across and down the face's picture, to pixels (x, y, 1)
+        times a number that is positive in front of the eye. Faces that are seen never
+        hide each other. Empty for an eye behind the monitor.
     """
     facing = np.cross(standing.down, standing.right)
     if (eye - standing.middle) @ facing <= 0:
@@ -141,7 +141,7 @@ class FollowServer:
         tracker: of the camera's vehicle.
         body: the tracker's name of the vehicle.
         camera: (3,), of the camera in the body's frame, metres.
-        say: told when the camera is lost, and found again.
+        say: called with a line when the camera is lost, and when it is found again.
 
     Raises:
         InputError: it cannot listen there.

@@ -127,7 +127,7 @@ def write_net(
         edges_mm: (3,), printed edges.
         paper: one of `PAPERS`.
         dpi: pixels an inch of the faces.
-        on_page: told about pages done, and all pages.
+        on_page: called with (pages done, all pages).
 
     Returns:
         Number of pages.

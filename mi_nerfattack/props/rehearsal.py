@@ -112,7 +112,7 @@ class SimulatedRoom:
 
 
 class SimulatedTracker(AbstractTracker):
-    """Tells the car's pose 50 times a second, whatever it is called."""
+    """Gives the car's pose 50 times a second, under any name of a body."""
 
     def __init__(self, room: SimulatedRoom) -> None:
         self._room = room
@@ -136,7 +136,7 @@ class SimulatedMotor(AbstractMotor):
         self._is_armed = True
 
     def check(self) -> None:
-        """It never starts anew."""
+        """Do nothing: a simulated controller never restarts."""
 
     def send(self, command: Command) -> Command:
         """Command it."""

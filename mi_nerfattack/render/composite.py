@@ -62,12 +62,12 @@ class AbstractComposite(ABC):
         seen: Seen,
         stop: float,
     ) -> Seen:
-        """Return the tangents of what was seen, from those of the fields' parameters.
+        """Return tangents of what was seen, from tangents of the fields' parameters.
 
         Args:
             posed: as given to :meth:`render`.
-            rays: likewise.
-            seen: what it returned.
+            rays: as given to :meth:`render`.
+            seen: what :meth:`render` returned.
             stop: as given to :meth:`render`.
         """
 
@@ -109,8 +109,8 @@ class AbstractComposite(ABC):
 
         Args:
             posed: as given to :meth:`render`.
-            rays: likewise.
-            seen: what it returned.
+            rays: as given to :meth:`render`.
+            seen: what :meth:`render` returned.
             cotangent: derivative of the objective by what was seen, per ray; no
                 layers where it depends on the total alone.
             stop: as given to :meth:`render`.
@@ -146,8 +146,8 @@ class AbstractComposite(ABC):
 
         Args:
             posed: as given to :meth:`render`.
-            rays: likewise.
-            seen: what it returned.
+            rays: as given to :meth:`render`.
+            seen: what :meth:`render` returned.
             cotangent: derivative of the objective by what was seen, per ray; no
                 layers where it depends on the total alone.
             stop: as given to :meth:`render`.

@@ -5,13 +5,14 @@ of samples, and the memory does not depend on it. The backward pass replays the
 forward pass: same positions, same occupancy, same termination.
 
 Steps. Along a ray, a fixed lattice ``t(i)``, i = 0, 1, ..., has spacing ``step`` up
-to the distance ``step / cone`` and grows exponentially after it. A sample stands for
-``[t(i), t(i + 1)]``, and takes density and radiance as constant on it; of a field that
-has no empty cell, for the part inside the bounding box. Lattice intervals whose sample
-lies in an empty cell of the occupancy are skipped: the density there is 0, and rises
-from it continuously (`Window`), so that no sample comes or goes at once when a
-ray moves. Where octants of cells are skipped, too, one of a small opacity does
-(`fit.pruning`). Beyond ``2**23`` steps in a box a ray sees nothing.
+to the distance ``step / cone`` and grows exponentially after it. A sample represents
+``[t(i), t(i + 1)]``, and takes density and radiance as constant on it. In a field that
+has no empty cell, it represents only the part inside the bounding box. Lattice
+intervals whose sample lies in an empty cell of the occupancy are skipped. The density
+there is 0, and rises from 0 continuously (`Window`), so that no sample comes or goes
+abruptly when a ray moves. Where octants of cells are skipped, too, samples of a small
+opacity do come and go (`fit.pruning`). Beyond ``2**23`` steps in a box a ray sees
+nothing.
 
 Error bounds, for a ray that runs l metres through the box and leaves it at t_far:
 
@@ -22,13 +23,14 @@ Error bounds, for a ray that runs l metres through the box and leaves it at t_fa
   of the error. Along the ray, let S_i and L_i bound the i-th derivative of density and
   of a colour. Optical depth is off by at most ``e = h^2 (l S_2 / 24 + S_1 / 4)``, and
   so is opacity; a colour by at most
-  ``e (L_0 + l L_1) + h^2 (L_1 S_0 (1 + S_0 h) / 12 + L_2 / 8)``; the moment likewise
-  with L_0 = t_far, L_1 = 1, L_2 = 0. Other jitters are of first order.
-- Where slopes jump, as between the vertices of a grid, their total variation takes the
-  place of second derivatives: opacity is off by at most ``h^2 V / 8``, V that of the
-  density; and with ``e = h^2 (V / 8 + S_1 / 4)`` and W that of a colour, the colour by
-  at most ``e (L_0 + l L_1) + h^2 S_0 (L_1 (1 + S_0 h) / 12 + W / 4)``.
-- Opacity and colour of homogeneous media are exact but for rounding.
+  ``e (L_0 + l L_1) + h^2 (L_1 S_0 (1 + S_0 h) / 12 + L_2 / 8)``. The same bound holds
+  for the moment with L_0 = t_far, L_1 = 1, L_2 = 0. Other jitters are of first order.
+- Where slopes jump, as between the vertices of a grid, their total variation replaces
+  the second derivatives. Let V be the total variation of the density's slope, and W of
+  a colour's slope. Opacity is off by at most ``h^2 V / 8``. With
+  ``e = h^2 (V / 8 + S_1 / 4)``, a colour is off by at most
+  ``e (L_0 + l L_1) + h^2 S_0 (L_1 (1 + S_0 h) / 12 + W / 4)``.
+- Opacity and colour of homogeneous media are exact except for rounding.
 """
 
 from __future__ import annotations
@@ -100,11 +102,11 @@ def march_derivative(  # noqa: D417  one entry describes three
     """Replay :func:`march` and propagate derivatives through the field.
 
     With ``w_k`` the weight and ``T_k+1`` the transmittance behind sample k:
-    ``dI/dL_k = w_k``, ``dI/dsigma_k = width_k (T_k+1 L_k - sum_{j>k} w_j L_j)``, and
-    likewise for opacity and moment; `sums.Rest` names the terms. Parameters of the
-    field (and nothing else) get their derivatives through Dr.Jit's graph: in backward
-    mode they are accumulated into ``dr.grad`` of every parameter with gradients
-    enabled; in forward mode they are read from there.
+    ``dI/dL_k = w_k``, ``dI/dsigma_k = width_k (T_k+1 L_k - sum_{j>k} w_j L_j)``. The
+    opacity and the moment have derivatives of the same form; `sums.Rest` names the
+    terms. Parameters of the field (and nothing else) get their derivatives through
+    Dr.Jit's graph: in backward mode they are accumulated into ``dr.grad`` of every
+    parameter with gradients enabled; in forward mode they are read from there.
 
     Sample positions and the ends of the interval count as constants along the ray;
     rays that only touch the box are not differentiated with respect to that.

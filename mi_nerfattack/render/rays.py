@@ -79,10 +79,11 @@ def put_rays(march: March, index: mi.UInt32) -> March:
 def meet_box(
     o: mi.Point3f, d: mi.Vector3f, lower: mi.Point3f, upper: mi.Point3f
 ) -> tuple[mi.Float, mi.Float]:
-    """Return where lines enter and leave a box, (n,); those that miss, after leaving.
+    """Return where lines enter and leave a box, (n,) each.
 
-    In place of `mi.BoundingBox3f.ray_intersect`, which takes the rays of the variant
-    alone that was set first in the process.
+    A line that misses the box enters after it leaves. This function replaces
+    `mi.BoundingBox3f.ray_intersect`, which takes only the rays of the variant that was
+    set first in the process.
     """
     safe = dr.select(dr.abs(d) < 1e-12, dr.copysign(mi.Vector3f(1e-12), d), d)
     a, b = (lower - o) / safe, (upper - o) / safe

@@ -139,9 +139,9 @@ class PackedMarch(AbstractSceneMarch):
     """An NGP on a CPU, from a copy of its parameters that is faster to read.
 
     Same positions, occupancy and termination as `render.march.march`, and the same
-    result but for rounding, in about half of the time. Where the transmittance equals
-    `stop` to the last digits, a ray may take one sample more or fewer: one in 300,000
-    did, and `stop` bounds the difference. Costs a copy of the table.
+    result except for rounding, in about half of the time. Where the transmittance
+    equals `stop` to the last digits, a ray may take one sample more or fewer: one in
+    300,000 did, and `stop` bounds the difference. Costs a copy of the table.
 
     Args:
         posed: an NGP that `PackedNGP` suits.

@@ -170,7 +170,7 @@ class Slope:
         Args:
             cotangent: the objective's derivative by the march.
             depths: as given to :meth:`change`.
-            colours: likewise.
+            colours: as given to :meth:`change`.
         """
         shared = cotangent.pair(self.by_depth)
         pairs = zip(depths, colours, strict=True)

@@ -1,4 +1,4 @@
-"""The way of rays from sample to sample, past one field or several.
+"""The way of rays from sample to sample, through one field or several.
 
 A :class:`Walk` follows the lattice of one field. A :class:`MergedWalk` merges the
 lattice intervals of all fields into segments on which the set of fields does not
@@ -33,7 +33,7 @@ class Path:
         begin: (n,), distance of `o` from the rays' origins, metres in the world.
         first: (n,), lattice point there.
         near: (n,), where density may begin, metres after `begin`.
-        far: (n,), where it ends, likewise.
+        far: (n,), where density ends at the latest, metres after `begin`.
     """
 
     o: mi.Point3f = field(default_factory=lambda: mi.Point3f(0))
@@ -78,13 +78,13 @@ class Path:
 
 @dataclass
 class Segment:
-    """Part of rays that a sample stands for.
+    """Part of rays that a sample represents.
 
     Attributes:
         t: (n,), position of the sample, metres.
         width: (n,), length of the part, metres.
-        active: (n,), rays that have one.
-        inside: (n,) for each field, rays on which it has one.
+        active: (n,), rays that have a sample.
+        inside: (n,) for each field, rays on which the field has a sample.
     """
 
     t: mi.Float

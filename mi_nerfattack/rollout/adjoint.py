@@ -84,12 +84,12 @@ class Replay(AbstractAdjoint):
 class KeptBackgrounds(AbstractAdjoint):
     """Keeps how scene and objects looked in each frame; renders nothing again.
 
-    Memory: what :class:`Replay` keeps and 20 bytes a layer, sample and period (colour,
-    opacity and depth in single precision): with a scene and one object, 0.5 MB a
-    vehicle and period at 200x66, 2.8 MB at 366x188. Exact composites keep 20 more.
-    Time: as Replay without rendering, so that forward and backward
-    together take less than 2 forward passes where the objects fill little of the
-    frame. The choice as long as the memory suffices.
+    Memory: as for :class:`Replay`, and 20 bytes per layer, sample and period. They hold
+    colour, opacity and depth in single precision. With a scene and one object this is
+    0.5 MB per vehicle and period at 200x66, or 2.8 MB at 366x188. Exact composites keep
+    20 bytes more. Time: as for Replay without rendering. So forward and backward
+    together take less than 2 forward passes where the objects fill little of the frame.
+    Choose this method as long as the memory suffices.
     """
 
     kind: Literal["kept_backgrounds"] = "kept_backgrounds"

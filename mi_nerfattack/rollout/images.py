@@ -49,10 +49,10 @@ class SceneImages:
         """Render the images of a batch.
 
         Args:
-            camera: sees.
+            camera: the camera on the vehicles.
             state: (m, n), as of :meth:`AbstractSensor.observe`.
-            step: likewise.
-            gains: the light on all layers; none for that of the capture.
+            step: as of :meth:`AbstractSensor.observe`.
+            gains: the light on all layers; none for the light of the capture.
         """
         count = dr.width(state)
         # From the state to rays, to their radiance, and to linear pixels

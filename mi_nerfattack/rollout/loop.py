@@ -58,8 +58,9 @@ class ClosedLoop:
             does, the control is 0.
         eight_bit: round images as a camera does; without it the policy gets what the
             sensor renders, and derivatives equal finite differences.
-        disturbance: of the sensor's images, before they are rounded; a row a vehicle.
-        route: that a policy is told points of; needed where it asks for them.
+        disturbance: of the sensor's images, before they are rounded; one row per
+            vehicle.
+        route: whose points a policy gets; needed where the policy asks for points.
     """
 
     sensor: AbstractSensor
@@ -103,7 +104,7 @@ class ClosedLoop:
         return to_state(self.dynamics.extend(np.atleast_2d(poses)))
 
     def numbers(self, state: Any, step: int) -> Any:
-        """Return what the policy is told besides images, (n, k), evaluated; or None.
+        """Return the numbers that the policy gets, (n, k), evaluated; or None.
 
         Args:
             state: (m, n) before the period.
@@ -163,7 +164,7 @@ def numbers_of(
         state: (m, n), its first rows px, py (metres) and theta (radians).
         speed: (n,), metres per second; not read unless asked for.
         time: seconds since the start.
-        route: that points are told of.
+        route: whose points the policy gets.
 
     Raises:
         InputError: the policy asks for points, and there is no route.

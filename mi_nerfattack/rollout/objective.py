@@ -80,7 +80,7 @@ class StateHistory:
         )
 
     def spread(self, weights: Any) -> Any:
-        """Repeat one number a control period, (T,), for all drives: (n T,).
+        """Repeat one number per control period, (T,), for all drives: (n T,).
 
         Raises:
             InputError: not T numbers.
@@ -106,12 +106,12 @@ class AbstractObjective(ABC):
     """Cost of a drive. Gradient methods make it smaller.
 
     Members are written in Dr.Jit operations; derivatives follow from automatic
-    differentiation. Cost: one launch forward and one backward a drive.
+    differentiation. Each drive costs one launch forward and one backward.
     """
 
     @abstractmethod
     def evaluate(self, states: StateHistory) -> Any:
-        """Evaluate one cost a drive, (n,), differentiable in `states.rows`."""
+        """Evaluate one cost per drive, (n,), differentiable in `states.rows`."""
 
     def costs(self, states: np.ndarray, dt: float) -> np.ndarray:
         """Evaluate the costs of recorded drives, (n,) float64.

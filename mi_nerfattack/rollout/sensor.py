@@ -16,7 +16,7 @@ from mi_nerfattack.render.posed import PosedField
 
 @dataclass(frozen=True)
 class Observation:
-    """One image a vehicle, and what is needed to look closer at it.
+    """One image per vehicle, and what its derivatives need.
 
     Attributes:
         image: tensor (n, height, width, 3), sRGB in [0, 1], evaluated.
@@ -75,8 +75,8 @@ class AbstractSensor(ABC):
 class AbstractDifferentiableSensor(AbstractSensor):
     """Sensor whose image can be differentiated by its parameters and by the state.
 
-    Parameters have keys, as those of a Mitsuba scene. The colours of objects, which are
-    attacked, are told as their textures, too.
+    Parameters have keys, like the parameters of a Mitsuba scene. The colours of the
+    objects, which an attack changes, are also available as textures.
     """
 
     @abstractmethod
@@ -179,7 +179,7 @@ class AbstractDifferentiableSensor(AbstractSensor):
 
         Args:
             state: (m, n), as given to ``observe``.
-            step: likewise.
+            step: as given to ``observe``.
             kept: of that observation.
         """
         del state, step

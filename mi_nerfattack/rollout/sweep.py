@@ -195,11 +195,12 @@ class Sweep:
         return d_state
 
     def finish(self) -> tuple[Any, Any]:
-        """Go back through policy and sensor, from all periods that wait for that.
+        """Differentiate policy and sensor, for all periods that wait for that.
 
         Returns:
-            By the state before the last of them: (3, n) through its image, None when
-            not `attached`; (m, n) through what else the policy is told, or None.
+            Derivatives by the state before the last of these periods: (3, n) through
+            its image, None when not `attached`; (m, n) through the numbers that the
+            policy gets, or None.
         """
         if not self._waiting:
             return None, None

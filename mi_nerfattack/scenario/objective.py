@@ -182,7 +182,7 @@ class FunctionTerm(AbstractStageTerm):
         return self.function.name.replace("\\", "/").rpartition("/")[2]
 
     def cost(self, route: Route, dynamics: AbstractDynamics) -> StageCost:
-        """Load the function and try it beside the lane, off its centre."""
+        """Load the function and try it at two poses off the lane's centre."""
         function = self.function.load("objective.term.function", self.trust_code)
         cost = UserCost(self.function.name, function)
         arc = np.array([0.25, 0.75]) * route.length

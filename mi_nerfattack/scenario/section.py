@@ -1,9 +1,9 @@
-"""Tables of a scenario file as strict models, and unions of them told by ``kind``.
+"""Tables of a scenario file as strict models, and unions that ``kind`` chooses from.
 
 The key ``kind`` of a table such as ``[vehicle]`` chooses which other keys the table
 has. Each choice is a :class:`Section`, or the dataclass that is built, with a `Literal`
-called ``kind``; :class:`Kinds` marks their union. The table ``[camera]`` is here, for
-a real car reads it, too.
+called ``kind``; :class:`Kinds` marks their union. The table ``[camera]`` is here
+because a real car reads it, too.
 """
 
 from __future__ import annotations
@@ -133,8 +133,8 @@ class Kinds:
     """Mark a union of sections and dataclasses that differ in their ``kind``.
 
     Args:
-        default: the kind of a table without the key; or a function that tells it by
-            the other keys.
+        default: the kind of a table without the key; or a function that derives the
+            kind from the other keys.
         family: section whose `group` names entry points of further kinds.
     """
 

@@ -126,7 +126,7 @@ class World:
         return label != SURROGATE and self.deployments[label].is_open_loop
 
     def builds_in(self, label: str) -> bool:
-        """Whether an environment must be opened anew for objects of another look."""
+        """Whether an environment must be opened again for other textures of objects."""
         return label != SURROGATE and self.deployments[label].builds_in
 
     def open(self, label: str, empty: bool = False) -> AbstractEnvironment:

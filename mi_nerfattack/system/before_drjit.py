@@ -1,6 +1,6 @@
 """Let Dr.Jit load this environment's LLVM, whoever imports it first.
 
-Installed beside the package as ``mi_nerfattack_llvm``, which a .pth file imports when
+Installed next to the package as ``mi_nerfattack_llvm``, which a .pth file imports when
 Python starts; see packaging.py.
 It looks for nothing until ``drjit`` is imported.
 """

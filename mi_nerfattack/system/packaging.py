@@ -12,7 +12,7 @@ NAME = "mi_nerfattack_llvm"
 
 
 class BuildWithPath(build_py):
-    """Lay before_drjit.py beside the package, with the .pth file that imports it."""
+    """Put before_drjit.py next to the package, with the .pth file that imports it."""
 
     def run(self) -> None:
         """Build, and write both where site-packages is filled from."""

@@ -24,18 +24,18 @@ LOCAL = "local"
 
 @dataclass(frozen=True)
 class RayTasks(AbstractWorkers):
-    """A task a piece, each in a process of its own.
+    """One task for each piece, each in a separate process.
 
-    Ray itself never does a task again: how often one is tried is the caller's matter,
-    and the same with every executor. Units of work are not told.
+    Ray itself never repeats a task. The caller decides how often a piece is tried, and
+    does so in the same way with every executor. Units of work are not reported.
 
     Args:
         address: of the cluster, HOST:PORT or ray://HOST:PORT; "auto": the one that
             this machine is part of; `LOCAL`.
-        cores: that a task is given.
-        memory_gb: likewise.
-        count: of tasks at a time, which the cluster of this machine is made for; None:
-            as many as it has cores for.
+        cores: cores of each task.
+        memory_gb: memory of each task, GB.
+        count: number of tasks at a time, for which a cluster of this machine is made;
+            None: as many as the machine has cores for.
     """
 
     address: str

@@ -26,14 +26,14 @@ _POLL_S = 0.5
 
 @dataclass(frozen=True)
 class SlurmJobs(AbstractWorkers):
-    """A job a piece; a job that is preempted or runs out of time is submitted again.
+    """One job for each piece; a preempted or timed out job is submitted again.
 
-    Jobs that are queued or running when this process is interrupted are cancelled;
-    killed, it leaves them to themselves. Units of work are not told.
+    When this process is interrupted, it cancels the jobs that are queued or running.
+    When it is killed, the jobs go on. Units of work are not reported.
 
     Args:
         folder: for scripts and logs; on a disk that all machines share.
-        partition: of the cluster; None: processes of this machine in its place.
+        partition: of the cluster; None: processes of this machine instead.
         cores: of each job.
         memory_gb: of each job.
         minutes: after which a job is stopped, and submitted again, up to three times.

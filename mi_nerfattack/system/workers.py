@@ -1,8 +1,10 @@
 """Numbered pieces of work, done here or by several processes.
 
-Of our own because `concurrent.futures` neither hears how far a piece is, nor ends its
-processes with the one that started them (SIGKILL included), nor tells which piece the
-process was at that died.
+We do not use `concurrent.futures` because it lacks three things:
+
+- It does not report how far a piece is.
+- It does not end its processes with the process that started them (SIGKILL included).
+- When a process dies, it does not say which piece this process was at.
 """
 
 from __future__ import annotations
@@ -87,7 +89,7 @@ class AbstractWork(ABC):
 
 
 def do_alone(work: AbstractWork, index: int) -> Told:
-    """Do one piece in a process that does nothing else, and tell what became of it."""
+    """Do one piece in a process that does nothing else, and return the outcome."""
     _use_one_thread()
     try:
         opened = work.open()
@@ -101,7 +103,7 @@ def do_alone(work: AbstractWork, index: int) -> Told:
 
 
 def failure(piece: int, told: Told) -> Exception | None:
-    """Return what another process told of a piece as an error; None if it is done."""
+    """Return the error of a piece from another process; None if the piece is done."""
     kind, text = told
     if kind in ("error", "refused"):
         return (InputError if kind == "error" else RefusedError)(text)
@@ -123,11 +125,12 @@ class AbstractWorkers(ABC):
         Args:
             work: see there.
             pieces: indices; each is done once, in any order.
-            report: called with units of work as they are done, here, where they can
-                be heard; an exception from it ends the work.
-            on_end: called with each piece that has ended, here; what it raises ends
-                the work, by default the error of a piece: an InputError from it, or of
-                a worker that ended in the midst of it; or a RuntimeError.
+            report: called in this process with units of work as they are done, where
+                workers report them; an exception from it ends the work.
+            on_end: called in this process with each piece that has ended; an exception
+                from it ends the work. By default it raises the error of a piece. The
+                error is an InputError from the piece, or of a worker that ended while
+                it did the piece; or it is a RuntimeError.
         """
         if pieces:
             self._do(work, pieces, report, on_end)
@@ -165,8 +168,8 @@ class InThisProcess(AbstractWorkers):
 class Processes(AbstractWorkers):
     """Several processes with one thread each for rendering and one for torch.
 
-    A process takes the next piece when it is done with one; a new one takes the place
-    of one that died or failed. They end with this process, however it ends.
+    A process takes the next piece when it has finished one. A new process replaces a
+    process that died or failed. All of them end with this process, however it ends.
 
     Args:
         count: 1 to `MOST`.
@@ -266,9 +269,9 @@ def chosen_workers(count: int | None, alone: bool) -> AbstractWorkers:
     """Return who does the work of a command.
 
     Args:
-        count: of processes, as ``--workers`` says; 1 works in this one. None for one a
-            core.
-        alone: whether None stands for 1.
+        count: number of processes, as ``--workers`` says; 1 works in this process.
+            None for one process per core.
+        alone: whether None means 1.
     """
     default = 1 if alone else available_cores()
     count = default if count is None else count

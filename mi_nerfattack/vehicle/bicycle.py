@@ -64,8 +64,8 @@ class RateLimitedAckermann(AbstractDynamics):
     `dx/dt = (v cos theta, v sin theta, v/l tan delta, rate)` with
     `rate = soft_limit((u - delta) / tau, max_steer_rate)`: a first-order lag whose
     rate is bounded. The command is bounded by `max_steer`, and so is an angle that
-    starts within it. Both limits are smooth and keep a derivative beyond them, if a
-    small one: while the wheels turn at their full rate, the command hardly matters.
+    starts within it. Both limits are smooth, and beyond them a small derivative
+    remains: while the wheels turn at their full rate, the command hardly matters.
 
     The lag makes the model stiff: explicit Euler needs steps below 2 tau, RK4 below
     2.7 tau.

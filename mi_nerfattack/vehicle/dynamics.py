@@ -111,11 +111,11 @@ def require_controls(given: int, names: Sequence[str]) -> None:
 def soft_limit(value: Any, limit: Any) -> Any:
     """Limit a value smoothly: `x / (1 + (x/limit)^8)^(1/8)`.
 
-    The function is odd, strictly increasing, equal to its argument within 0.05 % up
-    to half the limit and to 0.92 of the limit at the limit; its derivative is
-    `(1 + (x/limit)^8)^(-9/8)`, never zero, so that a saturated control can still be
-    moved by a gradient. A hyperbolic tangent would change the gain of a controller
-    by 10 % at half the limit.
+    The function is odd and strictly increasing. Up to half the limit it equals its
+    argument within 0.05 %; at the limit its value is 0.92 of the limit. The derivative
+    `(1 + (x/limit)^8)^(-9/8)` is never zero, so that a gradient can still move a
+    saturated control. A hyperbolic tangent would change the gain of a controller by
+    10 % at half the limit.
 
     Args:
         value: Dr.Jit array, any shape, in the unit of `limit`.

@@ -206,10 +206,11 @@ class Transition:
     the first control arrives the vehicle gets the control 0.
 
     Where the vehicles of a batch have delays (`AbstractDynamics.delays`), these add to
-    `delay`, and more than two controls may act in a period. A delay of ``n + f`` steps
-    need not be whole: an integration step then applies the mean over the step of what
-    arrives in it, ``f`` of the control n + 1 steps ago and ``1 - f`` of that n steps
-    ago. The derivative by the controls follows; a delay has none.
+    `delay`, and more than two controls may act in a period. A delay need not be a whole
+    number of steps. With a delay of ``n + f`` steps, an integration step applies the
+    mean of the controls that arrive during the step. This mean is ``f`` times the
+    control from n + 1 steps ago plus ``1 - f`` times the control from n steps ago. The
+    derivative by the controls follows; there is no derivative by a delay.
 
     Args:
         dynamics: the vehicle.
@@ -250,7 +251,7 @@ class Transition:
     def sources(self, period: int, like: Any) -> range:
         """Return the indices of the controls that act in a period, oldest first.
 
-        Negative indices stand for the control 0.
+        A negative index means the control 0.
 
         Args:
             period: index.

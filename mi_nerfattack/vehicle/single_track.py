@@ -75,7 +75,7 @@ class AbstractSingleTrack(AbstractDynamics):
         return states
 
     def saturate(self, control: Any) -> Any:
-        """Limit both rows of (2, n) with `soft_limit`, brakes by a limit of theirs."""
+        """Limit both rows of (2, n) with `soft_limit`, brakes by a separate limit."""
         steering, acceleration = control
         limit = dr.select(acceleration < 0, self.max_brake, self.max_acceleration)
         return type(control)(

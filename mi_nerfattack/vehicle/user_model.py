@@ -81,10 +81,10 @@ class FunctionDynamics(AbstractUserDynamics):
 
     Args:
         function: maps a state (m, n) and a control (n,), or several (k, n), within
-            its limit, to the m rows of the derivative, in Dr.Jit operations: an array
-            of the state's type, or a list or tuple of rows. It treats each vehicle
-            alone and reads nothing that changes, for it is called once and its kernels
-            are recorded.
+            its limit, to the m rows of the derivative, in Dr.Jit operations. It returns
+            an array of the state's type, or a list or tuple of rows. It treats each
+            vehicle alone. It reads nothing that changes, because it is called once and
+            its kernels are recorded.
         size: m, at least 3; the first rows are px, py, theta.
         limit: of ``|control|``, in its unit; applied by `soft_limit`. Of several
             controls one for all, or one for each.

@@ -14,17 +14,18 @@ _BORDER = 1  # texels around a triangle's box, which bilinear lookups reach
 
 @dataclass(frozen=True, eq=False)
 class Atlas:
-    """Where triangles lie in an image, without distortion, each in a box of its own.
+    """Where triangles lie in an image, without distortion, each in a separate box.
 
-    The box is one texel wider than the triangle on every side; texels beside the
-    triangle stand for its nearest point, so that bilinear lookups see no neighbour.
+    The box is one texel wider than the triangle on every side. A texel outside of the
+    triangle has the value of the triangle's nearest point, so that bilinear lookups do
+    not mix in a neighbouring triangle.
 
     Attributes:
         width, height: of the image, pixels.
         uv: (m, 3, 2), of the corners, in [0, 1], origin at the bottom left.
         rows, columns: (k,), texels that are used; row 0 is the top.
         triangles: (k,), which triangle each belongs to.
-        weights: (k, 3), barycentric coordinates of the point that each stands for.
+        weights: (k, 3), barycentric coordinates of the point whose value each has.
     """
 
     width: int

@@ -1,10 +1,15 @@
-"""glTF files made ready for trimesh, and what trimesh does not read of them.
+"""glTF files made ready for trimesh, and the features of glTF that trimesh ignores.
 
-trimesh takes no notice of samplers, second sets of texture coordinates,
-`KHR_texture_transform`, sparse, normalised or quantised accessors, skins, instances and
-morphing. What changes the picture is handed on (`BaseColour`), decoded into plain
-accessors, or refused by name here: so is every extension of nodes, meshes or their data
-that is not known, whether the file requires it or only uses it.
+trimesh ignores samplers, second sets of texture coordinates, `KHR_texture_transform`,
+sparse, normalised or quantised accessors, skins, instances and morphing. Where such a
+feature changes the picture, this module does one of three things:
+
+- It hands the feature on, as a `BaseColour`.
+- It decodes the feature into plain accessors.
+- It refuses the file and names the feature.
+
+The module also refuses every unknown extension of nodes, meshes or their data, whether
+the file requires the extension or only uses it.
 """
 
 from __future__ import annotations
@@ -111,17 +116,18 @@ class PreparedGltf:
 def prepare(
     path: Path, chunks: dict[str, bytes], load: Callable[[str], bytes]
 ) -> PreparedGltf:
-    """Read a .glb or .gltf file as JSON and check what trimesh would pass over.
+    """Read a .glb or .gltf file as JSON and check the features that trimesh ignores.
 
     Args:
         path: the file.
         chunks: gets binary data by the name that the JSON gives it.
-        load: returns one of `chunks`, or a file beside.
+        load: returns the bytes of one of `chunks`, or of a file in the folder of
+            `path` or below, by its name.
 
     Raises:
         FileNotFoundError: by `load`.
-        InputError: the file is not glTF 2.0 or is damaged, or uses what is not
-            supported; the message names it.
+        InputError: the file is not glTF 2.0, is damaged, or uses a feature that is
+            not supported; the message names the feature.
     """
     raw = files.read_bytes(path, MAX_BYTES)
     if path.suffix.lower() == ".glb":

@@ -120,7 +120,7 @@ def _add_skinned(tree: Any, mesh: Any, joints: np.ndarray, accessors: Accessors)
                     blend = blend + weights[:, k, None, None] * joints[used[:, k]]
         if isinstance(blend, float):
             raise ValueError("a mesh with a skin has no JOINTS_0")
-        total = blend[:, 3:, 3:]  # the sum of the weights, 1 but for rounding
+        total = blend[:, 3:, 3:]  # the sum of the weights, 1 except for rounding
         if not (total > 0).all():
             raise ValueError("a vertex hangs on no joint")
         linear, shift = blend[:, :3, :3] / total, blend[:, :3, 3] / total[:, 0]

@@ -43,9 +43,9 @@ def load_mesh(path: str | Path, up: str | None = None) -> TexturedMesh:
 
     Node transforms are applied, and meshes with a skin or instances lie where their
     joints or instances put them, without animation. Colours of glTF materials and
-    vertices are linear, those of OBJ and PLY sRGB, textures always sRGB. Opacity counts
-    where glTF says MASK or BLEND, but for that of vertices. Metal, gloss and emission
-    are left out.
+    vertices are linear, colours of OBJ and PLY are sRGB, and textures are always sRGB.
+    Where glTF says MASK or BLEND, the opacity of material and texture counts, but the
+    opacity of vertices does not. Metal, gloss and emission are ignored.
 
     Args:
         path: the mesh; textures lie where it says, in its folder or below.
@@ -53,9 +53,10 @@ def load_mesh(path: str | Path, up: str | None = None) -> TexturedMesh:
             for y in glTF and OBJ, z in PLY.
 
     Raises:
-        InputError: no such file, unknown suffix, unreadable or damaged file, no
-            triangle that has an area, a value that is not finite, a missing texture,
-            buffer or material file, or a feature that is not supported.
+        InputError: the file is missing, unreadable or damaged, or has an unknown
+            suffix. Also where no triangle has an area, a value is not finite, the
+            mesh uses a feature that is not supported, or a texture, buffer or
+            material file is missing.
     """
     import trimesh
 

@@ -123,7 +123,8 @@ def painted_mesh(field: GridField, mesh: TexturedMesh) -> ColouredMesh:
 def check_same_box(field: GridField, mesh: TexturedMesh) -> None:
     """Raise InputError unless the mesh has the box of the object, up to two voxels.
 
-    A field whose header tells no object is larger than the mesh by an unknown amount.
+    Where the field's header has no box of the object, the mesh need only lie within
+    the field's box, because the field is larger than the mesh by an unknown amount.
     """
     (low, high), (lower, upper) = mesh.bounds, object_box(field)
     beyond = np.concatenate([lower - low, high - upper])

@@ -35,10 +35,11 @@ class Scale:
     """How the metric scale was found.
 
     Attributes:
-        metres_per_unit: of the unit before; None where nothing told it.
-        spread: relative standard deviation between markers; None without.
+        metres_per_unit: metres of one unit before the alignment; None where the scale
+            is unknown.
+        spread: relative standard deviation between markers; None without markers.
         markers: number of photographs that show each marker, by id.
-        tracked: what motion capture gave; None without.
+        tracked: the fit to motion capture; None without motion capture.
     """
 
     metres_per_unit: float | None = None
@@ -56,13 +57,14 @@ def align(
     """Scale lengths to metres, turn z up and move the origin.
 
     z points up, against the mean of the images' downward directions, and the origin is
-    the mean of the cameras; where markers lie flat, z = 0 is their plane. Motion
-    capture gives axes and origin of its own.
+    the mean of the cameras; where markers lie flat, z = 0 is their plane. With motion
+    capture, axes and origin are those of the motion capture system.
 
     Args:
         found: with poses in any frame and unit.
         folder: of the photographs.
-        told: metres of one unit, or what tells them; None keeps the unit.
+        told: metres of one unit, or the distance, markers or motion capture from which
+            the scale follows; None keeps the unit.
         progress: called with stage, done and total.
 
     Raises:

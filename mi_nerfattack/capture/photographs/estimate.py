@@ -108,13 +108,14 @@ def estimate_poses(
     options: PoseOptions | None = None,
     progress: StageCallback = lambda stage, done, total: None,
 ) -> PoseEstimate:
-    """Estimate the poses of photographs, and write them beside copies of these.
+    """Estimate the poses of photographs; write poses and copies into one folder.
 
-    z points up, against the mean of the images' downward directions: photographs held
-    level on average are needed for that, or markers that lie flat. The origin is the
-    mean of the cameras, with flat markers on the ground below. The unit is arbitrary,
-    as photographs do not tell it, unless an option does; the JSON file's `units` says
-    which. Photographs that their EXIF data turn are stored upright.
+    z points up, against the mean of the images' downward directions. So the photographs
+    must be level on average, or markers must lie flat. The origin is the mean of the
+    cameras; with flat markers it is the point on the ground below. The unit is
+    arbitrary, because photographs alone have no scale, unless an option gives the
+    scale; `units` in the JSON file names the unit. Photographs that their EXIF data
+    turn are stored upright.
 
     Args:
         photographs: folder of at least 3 JPEG, PNG, WebP or HEIC images; at least 3 of

@@ -33,10 +33,11 @@ class FrameOptions:
     """Which frames of a video are taken.
 
     Attributes:
-        frames: at most.
-        baseline: how far the picture moves between two of them, in shares of its
-            longer edge, in a quarter of it or more; it is larger if there would be too
-            many, and down to a fifth if there would be fewer than 20.
+        frames: largest number of frames.
+        baseline: how far the picture moves between two frames, as a share of its
+            longer edge; a quarter of the picture moves at least so far. The program
+            takes a larger baseline if there would be too many frames. It takes a
+            smaller one, down to a fifth, if there would be fewer than 20.
     """
 
     frames: Count = 150

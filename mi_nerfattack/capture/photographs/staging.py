@@ -18,11 +18,12 @@ _SHOWN = 3  # names in a message
 
 
 class HeldCamera(NamedTuple):
-    """What tells photographs apart that share no intrinsics.
+    """How a photograph was taken: photographs with equal values share intrinsics.
 
     Attributes:
-        make, model: of the camera, from EXIF data; empty where these lack them.
-        focal_mm, focal_35mm, zoom: focal length, likewise, as text.
+        make, model: of the camera, from EXIF data; empty where EXIF data lack them.
+        focal_mm, focal_35mm, zoom: focal length from EXIF data, as text; empty where
+            EXIF data lack it.
         orientation: how EXIF data turn the stored picture, 1 to 8; 1 is not at all.
         width, height: of the upright picture, pixels.
     """

@@ -98,13 +98,16 @@ def read_tracked(path: Path, times: Mapping[str, float] | None = None) -> Tracke
 def fit_tracked(found: Structure, tracked: Tracked) -> HandEye:
     """Find scale, rotation and translation of a world, and the camera on the body.
 
-    With body B, camera on it X, world W of scale s and camera C, B X = W C: turns
-    between two photographs are alike up to X, which gives its rotation and then W's;
-    the places are linear in the rest. All are refined together, outliers counting less.
+    Let B be the pose of the body, X the camera's pose on the body, C the camera's pose
+    in the photographs' frame, and W, with a scale s, this frame's pose in the world.
+    Then B X = W C. Body and camera make equal turns between two photographs, up to X.
+    So the turns give the rotation of X, and then the rotation of W. The places are
+    linear in the translations of X and W and in s. At last all are refined together;
+    outliers count less.
 
     Args:
         found: poses of any frame and unit.
-        tracked: of the same photographs, or of some.
+        tracked: poses of the same photographs, or of some.
 
     Raises:
         InputError: too few photographs have both poses, the camera hardly turned about

@@ -2,8 +2,8 @@
 
 The device gives both eyes side by side, the left one left, as its lenses show them. The
 calibration is the file of its serial number, `SN<serial>.conf`, from
-``http://calib.stereolabs.com/?SN=<serial>`` or ``/usr/local/zed/settings/``. The lens
-stands in the section of eye and mode or, in newer files, in one of the eye alone.
+``http://calib.stereolabs.com/?SN=<serial>`` or ``/usr/local/zed/settings/``. The lens'
+parameters are in the section of eye and mode or, in newer files, of the eye alone.
 
 Source: stereolabs/zed-open-capture, videocapture_def.hpp.
 """
@@ -168,12 +168,12 @@ def _number(
 
 
 class LeftEye(AbstractPreparation):
-    """Makes a camera's frames of the left half of both eyes'.
+    """Makes a camera's frames from the left half of the device's pictures.
 
-    Each pixel shows what lies in its direction by the intrinsics and the distortion of
-    the camera asked for, whatever those of the eye are: frames are what a scene that is
-    rendered by this camera shows. The eye's picture is reduced by area means first,
-    where the camera has fewer pixels.
+    A frame looks like a scene that is rendered with `camera`: the intrinsics and the
+    distortion of `camera` give each pixel its direction, and the pixel shows the eye's
+    picture in this direction. The eye may have other intrinsics. Where `camera` has
+    fewer pixels than the eye, the eye's picture is first reduced by area means.
 
     Args:
         eye: calibration in the mode that the device is in.

@@ -1,4 +1,4 @@
-"""What ``mi-nerfattack car drive`` is told, on the command line or by a TOML file."""
+"""The settings of ``mi-nerfattack car drive``: the command line or a TOML file."""
 
 from __future__ import annotations
 
@@ -96,11 +96,14 @@ class DriveConfig(Section):
         """Return the drive of a policy.
 
         Args:
-            unit: of the control that the policy gives; None where nobody says.
-            wheelbase_m: of the car that its steering angles are for, likewise.
+            unit: of the control that the policy gives; None where its file does not
+                say.
+            wheelbase_m: of the car that the policy's steering angles are for; None
+                where its file does not say.
 
         Raises:
-            InputError: a key says otherwise, or nobody says the unit.
+            InputError: a key has another value than the policy's file, or neither of
+                them gives the unit.
         """
         found = {"control_unit": unit, "wheelbase_m": wheelbase_m}
         said = {key: value for key, value in found.items() if value is not None}
@@ -167,11 +170,11 @@ class DriveConfig(Section):
         )
 
     def settings(self, route: Route) -> DriveSettings:
-        """Return what the loop is told.
+        """Return the settings of the loop that drives the car.
 
         Raises:
             InputError: the fence or the calibration cannot be read, or the motor does
-                not turn as slowly or as fast as this.
+                not turn as slowly or as fast as the route's speed needs.
         """
         battery_least_v = 0.0
         if not self.simulated:

@@ -1,9 +1,9 @@
 """The log of a drive: an MCAP file of ROS 2 messages, whole up to where it is cut off.
 
-`TOPICS` names them; `deploy.replay.mcap` reads frames and poses. A message's stamp and
-time of publishing are when the thing was measured or sent, its log time when it was
-written: both by the host's monotonic clock, turned to wall time by one offset, which
-the metadata `clocks` hold.
+`TOPICS` names the messages; `deploy.replay.mcap` reads frames and poses. The stamp and
+the time of publishing of a message say when its content was measured or sent; the log
+time says when the message was written. All times come from the host's monotonic clock.
+One offset turns them into wall time; the metadata `clocks` hold it.
 """
 
 from __future__ import annotations
@@ -38,19 +38,19 @@ from mi_nerfattack.vehicle.route.route import Route
 
 @dataclass(frozen=True)
 class Figures:
-    """What a drive was like; None where there are too few commands.
+    """Figures of a drive.
 
     Attributes:
-        commands: sent.
+        commands: number of commands that the loop sent.
         duration_s: from the first command to the last.
-        laps: along the route, of a closed one; else shares of its length.
-        largest_error_m: cross-track error.
-        mean_error_m: likewise.
-        period_s: between commands, the mean.
-        period_jitter_s: its standard deviation.
-        longest_period_s: between two commands.
-        latency_median_s: from a frame's time to its command.
-        latency_99_s: likewise, the 99th percentile.
+        laps: laps of a closed route; of an open route, shares of its length.
+        largest_error_m: largest absolute cross-track error.
+        mean_error_m: mean absolute cross-track error.
+        period_s: mean time between commands.
+        period_jitter_s: standard deviation of the time between commands.
+        longest_period_s: longest time between two commands.
+        latency_median_s: median time from a frame to its command.
+        latency_99_s: 99th percentile of the time from a frame to its command.
     """
 
     commands: int
@@ -67,7 +67,7 @@ class Figures:
 
 @dataclass
 class Measures:
-    """One row a command: its time, its frame's time, and where the car was."""
+    """One row per command: its time, its frame's time, and the pose of the car."""
 
     rows: list[tuple[float, float, float, float, float]] = field(default_factory=list)
 

@@ -83,12 +83,13 @@ class _Seen:
 
 
 class DriveLoop:
-    """Drives as long as nothing speaks against it.
+    """Drives until a check fails, the time is up or the person lets go.
 
-    Frames go to the pilot once a control period, the newest at that time; a command is
-    sent when a decision of a new frame comes, and never else: it is the only sign of
-    life that the motor controller gets. All else is looked at in every round.
-    Whatever ends the drive, the car is braked and its wheels are centred first.
+    Once per control period, the loop gives the newest frame to the pilot. The loop
+    sends a command only when the pilot has decided on a new frame, because a command
+    is the only sign of life that the motor controller gets. The loop checks all other
+    devices in every round. However the drive ends, the loop first brakes the car and
+    centres its wheels.
 
     Args:
         devices: the motor must be armed.

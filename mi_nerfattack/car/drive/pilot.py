@@ -27,14 +27,14 @@ Control = Callable[[Frame], float]
 
 
 class LocalPilot(AbstractPilot):
-    """A policy that is evaluated beside the loop, always with the newest frame.
+    """A policy that a second thread evaluates, always with the newest frame.
 
-    What takes long, or for ever, shows as a decision that grows old.
+    Where the policy takes long, or never returns, the newest decision grows old.
 
     Args:
-        begin: returns the control of frames, without a memory of former ones; called,
-            as the control is, by the pilot's thread alone. See `policy_control` and
-            `expert_control`.
+        begin: returns a function that maps a frame to the control and has no memory of
+            former frames. Only the pilot's thread calls `begin` and this function. See
+            `policy_control` and `expert_control`.
         clock: of the loop.
     """
 
@@ -67,7 +67,7 @@ class LocalPilot(AbstractPilot):
             self._begins = True
 
     def close(self) -> None:
-        """End the thread, but for a policy that never comes back."""
+        """End the thread, unless its policy never returns."""
         with self._changed:
             self._closed = True
             self._changed.notify()
@@ -104,14 +104,17 @@ class LocalPilot(AbstractPilot):
 
 
 def policy_control(policy: AbstractPolicy, goal: int) -> Callable[[np.ndarray], float]:
-    """Return what a policy makes of images (height, width, 3), one after the other.
+    """Return the function from an image (height, width, 3) to a policy's control.
+
+    The images come one after the other.
 
     Args:
-        policy: one with memory starts with its initial one.
+        policy: a policy with memory starts with its initial memory.
         goal: of the route.
 
     Raises:
-        InputError: the policy is told more than images and goal.
+        InputError: the policy needs numbers, which the car does not measure, and not
+            only images and the goal.
     """
     from mi_nerfattack.deploy.environment import policy_image
 

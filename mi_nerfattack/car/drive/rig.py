@@ -1,4 +1,4 @@
-"""A car's devices, opened as they are told."""
+"""A car's devices, opened as the settings of the drive name them."""
 
 from __future__ import annotations
 

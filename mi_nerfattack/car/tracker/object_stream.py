@@ -67,12 +67,12 @@ class Block:
 def read_datagram(raw: bytes) -> Block:
     """Read a datagram.
 
-    An object is left out whose numbers are not finite or out of range, or whose
-    position is zero, which Tracker sends for what it does not see; so is an item of
-    another kind or size.
+    The function refuses an object whose numbers are not finite or are out of range. It
+    also refuses an object whose position is zero, because Tracker sends zero for an
+    object that it does not see. It ignores an item of another kind or size.
 
     Raises:
-        InputError: it is none of the object stream.
+        InputError: the datagram is not part of the object stream.
     """
     if len(raw) not in SIZES:
         sizes = ", ".join(map(str, SIZES))
@@ -109,7 +109,7 @@ def _refusal(values: np.ndarray) -> str:
 
 
 def to_rotation(rotation_rad: ArrayLike, convention: Convention) -> Rotation:
-    """Return the rotation, body to world, that three numbers stand for."""
+    """Return the rotation, body to world, that three numbers encode."""
     if convention == "euler":
         return Rotation.from_euler("XYZ", rotation_rad)
     return Rotation.from_rotvec(rotation_rad)

@@ -51,7 +51,7 @@ class Calibration(Section):
 
     @property
     def fastest_ms(self) -> float:
-        """Fastest speed that the motor is told."""
+        """Fastest speed that the program commands."""
         return self.erpm_most / self.erpm_per_ms
 
     def changed(self, values: Mapping[str, float]) -> Calibration:

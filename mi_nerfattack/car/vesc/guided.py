@@ -1,9 +1,10 @@
 """Calibration of a car by short drives, each measured on the floor afterwards.
 
-A drive with the servo held is an arc. Where its end lies, ahead and to the left of its
-start, gives its length and its curvature; the motor's steps over the length are the
-scale of speed, and the steering angles of several arcs over the servo's positions are
-a line, whose slope and foot are the scale and the centre of steering.
+A drive with the servo held is an arc. You measure how far the arc ends ahead and to the
+left of its start; this gives its length and its curvature. The motor's steps divided by
+the length are the scale of speed. The servo's position is a line in the steering angle
+of the arcs. Its slope is the scale of steering, and its value at a steering angle of 0
+is the centre.
 """
 
 from __future__ import annotations
@@ -66,10 +67,10 @@ class Arc:
         return 2 * self.left_m / (self.forward_m**2 + self.left_m**2)
 
     def check(self) -> None:
-        """Check that it tells anything.
+        """Check that the arc is long enough to calibrate with.
 
         Raises:
-            InputError: it is too short, or the motor did not turn.
+            InputError: the arc is too short, or the motor did not turn.
         """
         if not self.length_m > 0.1 or not self.steps:
             raise InputError(
@@ -96,9 +97,9 @@ def drive_arc(
         The servo's position, and the steps of the tachometer.
 
     Raises:
-        InputError: it does not get that far in time, its motor is not measured, it does
-            not stop, has a fault, or its kill switch is pressed.
-        DeviceLostError: the controller is lost, or has started anew.
+        InputError: the car does not get that far in time or does not stop. Also where
+            the motor is not measured or has a fault, or its kill switch is pressed.
+        DeviceLostError: the controller is lost, or has restarted.
     """
     calibration = motor.calibration
     wanted = distance_m * calibration.erpm_per_ms / _ERPM_PER_STEP
@@ -241,7 +242,7 @@ def read_arcs(path: Path) -> dict[Drive, Arc]:
     """Read arcs by their drives; none where there is no file.
 
     Raises:
-        InputError: it cannot be read, or an arc tells nothing.
+        InputError: the file cannot be read, or an arc fails `Arc.check`.
     """
     if not path.exists():
         return {}

@@ -1,7 +1,7 @@
-"""What a VESC is told and what it answers: the payloads of its frames.
+"""The commands to a VESC and its answers: the payloads of its frames.
 
-Numbers are integers, high byte first; of a fraction, the value times a scale, cut
-towards zero.
+Numbers are integers, high byte first. A fraction is sent as its value times a scale,
+cut towards zero.
 
 Source: VESC firmware, datatypes.h and comm/commands.c.
 """

@@ -152,8 +152,8 @@ class VescMotor(AbstractMotor):
         """Return the newest values, for which it asks without waiting; None at first.
 
         Raises:
-            DeviceLostError: the controller has fallen silent, or has started anew and
-                forgotten its timeout; the car must be armed again.
+            DeviceLostError: the controller has fallen silent, or has restarted and
+                forgotten its timeout; arm the car again.
         """
         answer, now = self._link.newest(Id.GET_VALUES_SELECTIVE), time.monotonic()
         waits_since = self._waits_since or now

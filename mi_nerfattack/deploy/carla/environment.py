@@ -41,9 +41,9 @@ _SETTLE_S = 1.5  # the car falls onto its springs and the camera's exposure sett
 class CarlaEnvironment(AbstractEnvironment):
     """A vehicle with a camera in a running CARLA server.
 
-    The server is in synchronous mode from the first call on, one tick a period, and is
-    given back by `close` and upon every error. Each reset spawns vehicle and cameras
-    anew. Objects are pasted by depth (appendix B.3).
+    From the first call on, the server is in synchronous mode with one tick per period.
+    `close` and every error give the server back. Each reset spawns vehicle and cameras
+    again. Objects are pasted by depth (appendix B.3).
 
     Args:
         server: where it runs, its town and weather.

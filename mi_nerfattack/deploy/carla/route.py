@@ -97,8 +97,8 @@ def town_routes(
         speed_ms: of the routes.
 
     Raises:
-        InputError: none of the routes is in the town, an unknown name, a position
-            beside all lanes, or one that no lane leads to.
+        InputError: none of the routes is in the town, a name is unknown, or a position
+            lies off all lanes or cannot be reached along lanes.
     """
     town = town_map.name.split("/")[-1]
     every = read_leaderboard(path)

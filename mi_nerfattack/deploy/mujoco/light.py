@@ -1,10 +1,10 @@
 """Sun and sky of a Mitsuba scene as MuJoCo's lights.
 
-MuJoCo multiplies textures by lights in the encoding of the image, where a path tracer
+MuJoCo multiplies textures by lights in the encoding of the image, whereas a path tracer
 works in linear radiance. For a power law both agree: with the exponent g = 1 / 2.2,
-`(albedo E)^g = albedo^g E^g`. A surface turned to the sun shows its texture as it is;
-ambient light is what is left of that in the shade, and the sun adds what is missing on
-level ground, which is exact there.
+`(albedo E)^g = albedo^g E^g`. A surface that faces the sun shows its texture unchanged.
+The ambient light gives every surface the brightness that it has in the shade. The
+sun's light adds the rest of the brightness of level ground, so level ground is exact.
 """
 
 from __future__ import annotations

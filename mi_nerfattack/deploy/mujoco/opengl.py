@@ -44,7 +44,7 @@ def make_context(width: int, height: int) -> Any:
 
     Args:
         width: of the largest image, pixels.
-        height: likewise.
+        height: of the largest image, pixels.
 
     Returns:
         an object with `make_current()` and `free()`.

@@ -98,12 +98,13 @@ class MujocoVehicle(AbstractVehicle):
     wheels measure it, through a motor with a lag of its own. All of it is
     deterministic: equal controls give equal bits.
 
-    Where the car takes an acceleration, too, the speed to hold changes by it, but never
+    Where the car takes an acceleration, too, this changes the speed to hold, but never
     below 0; motor and brakes act on the rear wheels, whose grip limits both.
 
-    The state is (x, y, theta, speed, steering angle, heading rate), of the point on the
-    ground under the middle of the rear axle: metres, radians (theta is not wrapped),
-    metres per second along the car, radians, radians per second.
+    The state is (x, y, theta, speed, steering angle, heading rate) of the point on the
+    ground under the middle of the rear axle. x and y are in metres, and theta is in
+    radians and not wrapped. The speed is in metres per second along the car, the
+    steering angle in radians and the heading rate in radians per second.
 
     Args:
         car: dimensions.
@@ -113,9 +114,9 @@ class MujocoVehicle(AbstractVehicle):
         timestep: of the physics, seconds, at most 0.002.
 
     Raises:
-        InputError: a period that is no multiple of the timestep, a timestep out of
-            range, a car that steers about a point between its rear wheels, or one with
-            another second control than an acceleration.
+        InputError: the period is no multiple of the timestep, or the timestep is out
+            of range. Also where the car steers about a point between its rear wheels,
+            or has a control besides steering and an acceleration.
     """
 
     def __init__(

@@ -28,21 +28,21 @@ from mi_nerfattack.vehicle.route.route import Route
 class ReplayEnvironment(AbstractEnvironment):
     """A recorded drive, in an open loop.
 
-    What was driven is what is seen: start pose, seed and controls have no effect, and
-    `step` only notes the control. After each period comes the frame nearest in time.
-    Objects are pasted by depth; where a recording has no depth, they are in front of
-    everything.
+    The environment shows the recording: start pose, seed and controls have no effect,
+    and `step` only notes the control. After each period comes the frame nearest in
+    time. Objects are pasted by depth; where a recording has no depth, they are in front
+    of everything.
 
     Args:
         recording: frames, times and poses; closed with the environment.
-        mount: of the camera, to tell the vehicle's pose from it.
+        mount: of the camera, from which the vehicle's pose follows.
         period: seconds between two frames.
         max_control: largest control of the policy; it has no effect.
         control_unit: of the control.
         more_controls: of the policy, after the first one.
 
     Attributes:
-        controls: what the policy would have done since the last reset: a number a
+        controls: the controls of the policy since the last reset: one number per
             period, or (k,) of k > 1 controls.
     """
 

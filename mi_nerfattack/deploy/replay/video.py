@@ -32,11 +32,12 @@ from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
 
 
 class VideoRecording(AbstractRecording):
-    """A video, and beside it a pose file of the same name (`drive.mp4`, `drive.csv`).
+    """A video and its pose file of the same name (`drive.mp4` and `drive.csv`).
 
-    Poses without times are those of the frames in their order, and as many; poses with
-    times are interpolated, and every frame needs one within 0.1 s. Frames are decoded
-    when they are asked for; going back starts again from the first.
+    Both files are in one folder. A file of poses without times has one pose for each
+    frame, in the order of the frames. Poses with times are interpolated, and every
+    frame needs a pose within 0.1 s. Frames are decoded when the caller asks for them;
+    an earlier frame than the last is decoded from the start of the video.
 
     Args:
         path: any container and codec that PyAV decodes.

@@ -1,1 +1,1 @@
-"""Where objects stand beside the routes of a scene, drawn at random."""
+"""Where objects stand at the roadside of a scene's routes, drawn at random."""

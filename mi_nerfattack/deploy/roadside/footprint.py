@@ -18,11 +18,12 @@ _POINTS = 64
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """What is occupied of a field that stands on z = 0 of its frame.
+    """The occupied part of a field that stands on z = 0 of its frame.
 
     Attributes:
-        lower: (3,) of the box around the occupied cells, metres in the field's frame.
-        upper: (3,), likewise.
+        lower: (3,), lower corner of the box around the occupied cells, metres in the
+            field's frame.
+        upper: (3,), upper corner of this box.
         points: (64, 3) points in occupied cells.
     """
 
@@ -74,7 +75,7 @@ class Stands:
     """Boxes of one shape that stand upright, n of them.
 
     Attributes:
-        shape: theirs.
+        shape: the shape of all boxes.
         centre: (n, 2) of the boxes seen from above, metres in the world.
         ground: (n,), height of the ground, metres.
         yaw: (n,), radians.

@@ -36,20 +36,26 @@ _BEND = math.radians(5)  # where it turns by less than this over their length
 @dataclass(frozen=True)
 @checked("Roadside")
 class Roadside:
-    """Where such things stand: beside the road, on the ground, free, and in view.
+    """Where objects may stand: at the roadside, on free ground and in view.
 
-    Objects stand off the lanes of all routes, beyond the kerb where a route has one,
-    on even ground with nothing above it, clear of walls and of one another. One whose
-    occupied box is at least 1.5 times as long as wide stands along the road to 4
-    degrees, either way round; others at any angle. A board, which is thinner than a
-    quarter of its width and of its height, faces the traffic on the route to 4 degrees
-    instead: by the wider of its -x and -y sides. A patch, which is lower than a quarter
-    of its length and of its width, lies on the lane of the route instead, where the
-    lane is as good as straight, +y along the lane to 4 degrees, and the drive goes on
-    for 2 s after it, or for half of its length where it is short. Each is seen from a
-    drive along the lane's centre: in frames of `view_s` together, not necessarily in a
-    row, about `view_px` pixels or more show a part of it that neither the scene nor
-    another object hides, as 64 of its points tell.
+    Objects stand off the lanes of all routes, beyond the kerb where a route has one.
+    They stand on even ground with nothing above it, clear of walls and of one another.
+    The shape of an object's occupied box decides its heading:
+
+    - A box that is at least 1.5 times as long as wide stands along the road, within 4
+      degrees, either way round.
+    - A board is thinner than a quarter of its width and of its height. The wider of its
+      -x and -y sides faces the traffic on the route, within 4 degrees.
+    - A patch is lower than a quarter of its length and of its width. It lies on the
+      lane of the route, where the lane is nearly straight, with +y along the lane
+      within 4 degrees. The drive goes on for 2 s after the patch; a short drive goes on
+      for at least half of its length.
+    - Any other object stands at any angle.
+
+    A drive along the lane's centre sees every object for `view_s` together. In these
+    frames, which need not follow one another, about `view_px` pixels or more show a
+    part of the object that neither the scene nor another object hides. The rule checks
+    64 points of the object.
 
     Args:
         scales: range of the factor to the natural size, of each object in turns.

@@ -56,8 +56,9 @@ class Surroundings:
     def kerb(self, route: Route, arc: np.ndarray, side: np.ndarray) -> np.ndarray:
         """Return how far the road's edge is from a route's centre, (n,), metres.
 
-        It is the kerb, looked for up to two lane widths beyond the lane, infinite where
-        there is none; the lane's own edge on a route that has hardly any.
+        The edge is the kerb, which the function looks for up to two lane widths beyond
+        the lane. The distance is infinite where there is no kerb. On a route with
+        hardly any kerb, the lane's edge is the road's edge.
 
         Args:
             route: of the lane.
@@ -104,8 +105,8 @@ class Surroundings:
 
         Args:
             route: of the lane.
-            begin: arc length, metres.
-            end: likewise.
+            begin: arc length at the start of the drive, metres.
+            end: arc length at the end of the drive, metres.
         """
         step = route.speed_ms * self.period
         arc = begin + step * np.arange(int((end - begin) / step + 1e-6) + 1)

@@ -35,7 +35,7 @@ class PoseError:
         return bool(self.placement_m or self.turn_deg)
 
     def offsets(self, offsets: np.ndarray, seed: int) -> np.ndarray:
-        """Put objects down anew.
+        """Add a drive's error of placement to the offsets of objects.
 
         Args:
             offsets: (k, 6), shift in metres and rotation vector of each object, world
@@ -43,7 +43,8 @@ class PoseError:
             seed: of the drive.
 
         Returns:
-            (k, 6), likewise; where nothing moves, what was given.
+            (k, 6), the offsets with the error, in the same form; `offsets` itself
+            where `moves_objects` is false.
         """
         if not self.moves_objects:
             return offsets
@@ -56,7 +57,7 @@ class PoseError:
         return found
 
     def mount(self, mount: CameraMount, seed: int) -> CameraMount:
-        """Mount a camera anew; without an error, the mount that was given."""
+        """Return a mount with a drive's error of pitch; without error, `mount`."""
         if not self.pitch_deg:
             return mount
         error = self.pitch_deg * float(self._rng(seed).normal())

@@ -22,10 +22,10 @@ _STREAM = 5  # of a drive's seed
 
 
 class AbstractAround(AbstractEnvironment):
-    """An environment around another one, which it is but for what it changes.
+    """An environment around another one, equal to it except for one change.
 
     Args:
-        inside: the other one; is reset, driven and closed.
+        inside: the other environment, which this one resets, drives and closes.
     """
 
     def __init__(self, inside: AbstractEnvironment) -> None:
@@ -155,7 +155,7 @@ class LateControls(AbstractAround):
         return self.inside.step(self._exchange(control))
 
     def advance(self, control: Controls) -> None:
-        """Likewise, and look at nothing."""
+        """Take a control and hold the one whose turn it is, without a new frame."""
         self.inside.advance(self._exchange(control))
 
     def _exchange(self, control: Controls) -> Controls:

@@ -167,7 +167,7 @@ class AbstractView(ABC):
         """
 
     def show(self, objects: Sequence[PosedField]) -> None:
-        """Paste radiance fields in place of those shown before.
+        """Paste radiance fields instead of the former ones.
 
         Args:
             objects: may be empty.

@@ -123,7 +123,7 @@ class PackedGrid:
     `HashGridEncoding` gathers feature by feature, and a kernel moves most of its
     intermediate results through memory. Here a vertex takes one gather for every two
     features, and each level is a block of its own, so that a few numbers are in use at
-    a time. The features are those of the encoding but for rounding; there are no
+    a time. The features are those of the encoding except for rounding; there are no
     derivatives.
 
     Args:

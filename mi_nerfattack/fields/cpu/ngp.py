@@ -21,18 +21,18 @@ class PackedNGP:
     """A copy of an NGP's parameters with less to do at a sample.
 
     The last layer of the density network and the first of the colour network are
-    linear: they become one matrix. What the view adds to that layer is computed once a
-    ray. Weights are numbers of the kernel, so that sums stay in registers; Dr.Jit's
-    products with matrices in memory take them through memory, and a march 1.4 times as
-    long. A kernel is good for one set of weights; compiling it takes 1 s for 3,300 of
-    them, 4 s for 11,000. Values are those of
-    :meth:`NGPField.eval` but for rounding.
+    linear: they become one matrix. The contribution of the view to that layer is
+    computed once per ray. Weights are literals of the kernel, so that sums stay in
+    registers. Dr.Jit's products with matrices in memory keep the sums in memory, and
+    the march takes 1.4 times as long. A kernel is good for one set of weights;
+    compiling it takes 1 s for 3,300 weights and 4 s for 11,000. Values are those of
+    :meth:`NGPField.eval` except for rounding.
 
     Args:
         field: the field, on the LLVM backend; see :meth:`suits`.
 
     Attributes:
-        digest: what tells the weights from others.
+        digest: SHA-256 of the weights, which identifies them.
     """
 
     def __init__(self, field: NGPField) -> None:

@@ -82,7 +82,7 @@ class BakePlan:
 
     @property
     def peak_mb(self) -> float:
-        """Memory that baking takes beside the field, MB."""
+        """Memory that baking takes in addition to the field, MB."""
         return _WORDS_BAKING * self.file_mb
 
 
@@ -133,11 +133,12 @@ def bake(
 ) -> BrickField:
     """Bake a field into bricks, as cameras along routes see it.
 
-    Vertices begin with the field's density and, seen from the nearest place on a route,
-    its colour there. Then rays from poses along the routes are marched through the
-    field; at their samples the difference of bricks and field goes back to the eight
-    vertices around, by the weight that the sample has in its pixel. So colours off the
-    surfaces become what the surfaces need, and views are averaged.
+    Vertices begin with the field's density, and with the field's colour as seen from
+    the nearest place on a route. Then the baking marches rays from poses along the
+    routes through the field. At each sample it corrects the eight vertices around by
+    the difference of field and bricks, in proportion to the weight that the sample has
+    in its pixel. So vertices off the surfaces get the colours that the surfaces need,
+    and views are averaged.
 
     Args:
         scene: an :class:`NGPField` at its pose in the routes' frame.

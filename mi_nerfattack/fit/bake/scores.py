@@ -33,13 +33,14 @@ def score_bake(
     keep: int = 4,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[ViewScore]:
-    """Compare bricks with their field on the routes and beside, on either side.
+    """Compare bricks with their field, on the routes and to the left and right.
 
-    Beside is 1 m where a lane is 3.5 m wide, and in proportion.
+    The views to the left and right are 1 m off the route where a lane is 3.5 m wide,
+    and in proportion for other lanes.
 
     Args:
         scene: the field at its pose in the routes' frame.
-        baked: the bricks at theirs.
+        baked: the bricks at their pose in the same frame.
         routes: at least one.
         camera: intrinsics.
         mount: of the camera on the vehicle; None for the default mount.

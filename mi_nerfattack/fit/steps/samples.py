@@ -28,7 +28,7 @@ class Samples:
         fits: (n,), whether a ray has all its samples.
         ray: (m,), the ray of a slot.
         t: (m,), position on the ray, metres.
-        width: (m,), length of the interval that the sample stands for, metres, times
+        width: (m,), length of the interval that the sample represents, metres, times
             the field's window there.
     """
 
@@ -250,8 +250,8 @@ def cotangents(
 
     With ``w_k`` the weight of a sample, ``T_k+1`` the transmittance behind it and
     ``g_k`` the objective's derivative by the weight:
-    ``dJ/dx_k = T_k+1 g_k - sum_{j>k} w_j g_j``. This is :class:`Rest` in one sum, of
-    ``w_j g_j``, in place of one for each part of a march.
+    ``dJ/dx_k = T_k+1 g_k - sum_{j>k} w_j g_j``. This computes :class:`Rest` with one
+    sum, of ``w_j g_j``, instead of one sum for each part of a march.
 
     Args:
         samples: n rays, m slots.

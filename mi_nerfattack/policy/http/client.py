@@ -115,7 +115,7 @@ class PolicyClient:
             image: see the module.
             goals: (n,).
             step: number of images before this one in the drive.
-            numbers: (n, k), what the policy is told besides; None for nothing.
+            numbers: (n, k), the further numbers that the policy gets; None for none.
 
         Returns:
             (n,) or (n, k) numbers as the server gives them, float64.

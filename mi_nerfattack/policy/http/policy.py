@@ -20,10 +20,11 @@ class HttpPolicy(AbstractBlackBox):
         url: http or https.
         timeout_s: longest wait for a whole answer.
         retries: how often a failed request is repeated.
-        preprocess: as for `AbstractBlackBox`; action likewise.
-        inputs: the server gets the numbers that it names, and the frame as it is,
-            images of several cameras side by side.
-        token: that the server wants.
+        preprocess: as for `AbstractBlackBox`.
+        action: as for `AbstractBlackBox`.
+        inputs: the server gets the numbers that `inputs` names, and the frame
+            unchanged, with the images of several cameras side by side.
+        token: that the server asks for.
     """
 
     def __init__(

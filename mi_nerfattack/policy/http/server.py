@@ -122,7 +122,8 @@ class PolicyServer(HttpServer):
             images: (n, height, width, 3) float32 in [0, 1].
             goals: (n,).
             step: images before these in the drive.
-            numbers: (n, k) float32, what the policy is told besides; None for nothing.
+            numbers: (n, k) float32, the further numbers that the policy gets; None for
+                none.
         """
         began = time.perf_counter()
         with self._deciding:
@@ -170,7 +171,7 @@ class PolicyServer(HttpServer):
 
     @property
     def numbers(self) -> Numbers:
-        """What the policy is told besides images and goal."""
+        """The numbers that the policy gets besides images and goal."""
         return self._policy.numbers
 
     def figures(self) -> dict[str, Any]:

@@ -112,10 +112,10 @@ class Input:
 class OnnxNetwork(torch.nn.Module):
     """Graph of ONNX operators, evaluated one by one.
 
-    Arguments go to the graph's inputs in their order; its outputs come back in
-    theirs. Floating constants are buffers, so that ``.double()`` and ``.to(device)``
-    work; all floating types are one in an evaluation. Slower than a runtime by the
-    Python of each node, about 20 us.
+    Arguments go to the graph's inputs in the graph's order, and its outputs come back
+    in the graph's order. Floating constants are buffers, so that ``.double()`` and
+    ``.to(device)`` work; all floating types are one in an evaluation. Each node is
+    about 20 us slower than in a runtime, because Python calls it.
 
     Attributes:
         batch: the number of images that it takes, None where any.

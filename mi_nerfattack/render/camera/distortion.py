@@ -110,8 +110,8 @@ def is_invertible(
     """Tell whether `undistort` finds distorted positions again, without a fold.
 
     Args:
-        u: positions all over an image.
-        v: likewise.
+        u: horizontal positions all over an image.
+        v: vertical positions all over an image.
         lens: as `Camera.distortion`.
         tolerance: of the positions.
     """

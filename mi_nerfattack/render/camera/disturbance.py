@@ -2,10 +2,10 @@
 
 An image is decoded to linear light, blurred, multiplied by the exposure, clipped,
 encoded as sRGB, and noise is added: the order in a camera, whose optics blur light
-before the sensor counts it. Noise has one standard deviation in sRGB values: that of
-counted photons grows as the root of the light, and the sRGB curve is nearly a root,
-which makes it constant (Anscombe 1948; Foi et al. 2008 on sensors). It is what
-policies are trained with, too.
+before the sensor counts it. The noise has one standard deviation in sRGB values,
+because the noise of counted photons grows as the root of the light. The sRGB curve is
+nearly a root, which makes this noise constant (Anscombe 1948; Foi et al. 2008 on
+sensors). Policies are trained with the same noise.
 """
 
 from __future__ import annotations
@@ -75,10 +75,11 @@ class Disturbance:
         """Disturb the images of a batch.
 
         Args:
-            image: tensor (n, height, width, 3), sRGB in [0, 1], a row a drive.
+            image: tensor (n, height, width, 3), sRGB in [0, 1], one row per drive.
             step: index of the control period, from 0.
-            layout: of the images of several cameras in it. They have one exposure and
-                one blur, which ends where an image does, and noise of their own.
+            layout: of the images of several cameras in it. All cameras have the same
+                exposure and the same blur, which ends at the edges of each image. Their
+                noise is independent.
 
         Returns:
             a tensor like it; differentiable.
@@ -98,12 +99,13 @@ class Disturbance:
     def vjp(
         self, image: Any, step: int, d_shown: Any, layout: Layout | None = None
     ) -> Any:
-        """Return the derivative by the image from the one by what is shown.
+        """Return the derivative by the image from the derivative by the result.
 
         Args:
             image: as given to :meth:`apply`.
-            step: likewise.
-            d_shown: derivative of the objective by its result, of the same shape.
+            step: as given to :meth:`apply`.
+            d_shown: derivative of the objective by the result of :meth:`apply`, of the
+                same shape.
             layout: as given to :meth:`apply`.
         """
         result = vjp(lambda x: self.apply(x, step, layout), image, d_shown)
@@ -129,8 +131,8 @@ def disturbed(
         blurs: (n,), standard deviations, pixels.
         noise_sd: standard deviation of the noise, sRGB in [0, 1].
         seed: of the noise.
-        step: likewise.
-        first: likewise, number of the first image.
+        step: index of the control period, on which the noise depends, too.
+        first: number of the first image, on which the noise depends, too.
         layout: of the images of several cameras; None for one.
 
     Returns:
@@ -242,8 +244,8 @@ def standard_normal(
 
     Args:
         kind: type of the result.
-        shape: (n, ...), of a row a drive; other n have the same rows.
-        seed: of all.
+        shape: (n, ...), one row per drive; a row does not depend on n.
+        seed: of all numbers.
         step: index of the control period.
         first: number of the first row.
 

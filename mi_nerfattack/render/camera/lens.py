@@ -103,7 +103,7 @@ def mount_pose(
         forward_m: as in `CameraMount`.
         pitch_deg: like the height.
         left_m: as in `CameraMount`.
-        yaw_deg: likewise.
+        yaw_deg: as in `CameraMount`.
 
     Returns:
         origin (`mi.Point3f`) and the columns (right, down, forward) of the rotation

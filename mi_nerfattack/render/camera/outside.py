@@ -40,7 +40,7 @@ class Overhead:
 
         Args:
             points: (n, 2), metres.
-            margin_m: beside the outermost.
+            margin_m: around the outermost points, metres.
             longest_px: of the longer edge.
         """
         low, high = points.min(0) - margin_m, points.max(0) + margin_m

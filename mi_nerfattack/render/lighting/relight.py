@@ -1,16 +1,17 @@
 """Light inserted objects by a scene's emitters, and let them cast shadows.
 
 A field holds the light that left its surfaces when it was captured. An inserted object
-is lit otherwise where it stands: its radiance is read as a diffuse reflectance rho, so
+is lit otherwise in the scene: its radiance is read as a diffuse reflectance rho, so
 that a ray shows ``rho E / pi`` with E the irradiance of the object's expected surface.
-This holds for objects that ``capture.object_renders`` renders: its light makes the
-radiance of a surface that faces the key equal to rho, and no less than 0.75 rho
-elsewhere but for occlusion, and that shading stays in.
+This holds for objects that ``capture.object_renders`` renders. The light there makes
+the radiance of a surface that faces the key light equal to rho. Elsewhere it makes the
+radiance at least 0.75 rho, except for occlusion. This shading stays in the object.
 
-What surrounds the object is darkened by the share of its irradiance that the object
-takes: the ratio of the irradiance with and without it, of the same light samples, so
-it is exactly 1 where no shadow ray meets an object. The ratio multiplies all radiance,
-as if light that came over other surfaces were shadowed like that of the emitters.
+An object darkens its surroundings by a ratio: their irradiance with the object, divided
+by their irradiance without it. Both irradiances come from the same light samples, so
+the ratio is exactly 1 where no shadow ray meets an object. The ratio multiplies all
+radiance, as if the object shadowed the light from other surfaces like the light from
+the emitters.
 
 Left out:
 

@@ -1,15 +1,16 @@
 """Other light on a captured object: factors of its radiance over its box.
 
 A field holds the light that left its surfaces when it was captured. Under another
-light, a diffuse surface gives ``E / E_0`` of that, with the irradiances under both. The
-ratio depends on place and normal, and on what the object itself shades; so it is kept
-at the vertices of a lattice over the object's box, one *map* for each light, and
-interpolated between them at the samples of a march.
+light, a diffuse surface sends out ``E / E_0`` times this light, where E is the
+irradiance under the other light and E_0 the irradiance at capture. The ratio depends on
+place and normal, and on the shadows of the object on itself. Therefore it is stored at
+the vertices of a lattice over the object's box, one *map* for each light. At the
+samples of a march it is interpolated between the vertices.
 
 How a map is made: parallel rays from many sides find the object's surface and its
 normals (`expected_surface`). From there, shadow rays go through the object's density to
-each direction of a light. What a lattice vertex gets is the mean of the points around;
-vertices without points get those of the nearest one that has some.
+each direction of a light. A lattice vertex gets the mean of the points around it; a
+vertex without points gets the mean of the nearest vertex that has points.
 
 Left out: shadows of other objects and of the scene, light that one part of the object
 throws on another, and shades sharper than a cell of the lattice. Where two faces lie in

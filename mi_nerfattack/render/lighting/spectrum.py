@@ -1,9 +1,9 @@
 """Turn linear RGB into the variant's spectrum, linearly.
 
-Fields hold linear Rec. 709 RGB. In spectral variants, a colour ``(r, g, b)`` stands
-for the reflectance ``r s_R + g s_G + b s_B``, and as radiance for that times
-Mitsuba's D65. The three basis reflectances lie in [0, 1], add up to 1, and reproduce
-the primaries under D65, so white is the illuminant itself. The map is linear:
+Fields hold linear Rec. 709 RGB. In spectral variants, a colour ``(r, g, b)`` means
+the reflectance ``r s_R + g s_G + b s_B``. As a radiance, it means this reflectance
+times Mitsuba's D65. The three basis reflectances lie in [0, 1], add up to 1, and
+reproduce the primaries under D65, so white is the illuminant itself. The map is linear:
 compositing before and after it gives the same, and its derivative is exact. Stock
 ``rgb`` spectra are sigmoids of polynomials instead: they agree in every colour that a
 film records, but not wavelength by wavelength.

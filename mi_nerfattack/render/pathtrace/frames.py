@@ -77,8 +77,9 @@ class FrameRenderer:
     After the first frame no kernel is compiled, whatever the poses and seeds. Not
     differentiable.
 
-    Cost: one render a frame; samples beyond 2^24 rays are split into passes whose
-    mean is taken, so that the device's memory does not grow with `spp`.
+    Cost: one render per frame. Samples beyond 2^24 rays are split into passes, and the
+    frame is the mean of the passes, so that the device's memory does not grow with
+    `spp`.
 
     Args:
         path: scene file.

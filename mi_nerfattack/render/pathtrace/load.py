@@ -111,7 +111,7 @@ def load_scene(
 
     Args:
         path: XML file; the files it names are relative to its folder.
-        parameters: values of its ``$NAME``, in place of the `<default>` ones.
+        parameters: values of the file's ``$NAME``, instead of the `<default>` values.
         size_px: width and height of all films, as if the file gave them; None keeps
             the file's.
         shapes: `mi.Shape` by name that the scene gets besides its own.

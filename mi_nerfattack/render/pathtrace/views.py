@@ -1,9 +1,9 @@
 """Render posed views of Mitsuba scenes: colour, opacity and depth.
 
-One sensor is kept and moved from view to view. Compared with Mitsuba's `batch` sensor,
-whose scene must be built (and whose kernels compiled) again for other poses, it
-compiles nothing after the first view, and no reconstruction filter crosses from one
-view into the next.
+The renderer keeps one sensor and moves it from view to view. It compiles nothing after
+the first view, and no reconstruction filter crosses from one view into the next. A
+scene with Mitsuba's `batch` sensor must be built again for other poses, and its kernels
+must be compiled again.
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ def frame_metadata(
             left out.
 
     Returns:
-        by name, JSON but for what is text itself: ``camera`` with its ``to_world``,
-        ``pose_convention``, ``seed``, ``spp``, ``variant``, ``versions``, ``digests``
-        and `more`.
+        by name, as JSON, or unchanged where a value is text: ``camera`` with its
+        ``to_world``, ``pose_convention``, ``seed``, ``spp``, ``variant``, ``versions``,
+        ``digests`` and `more`.
     """
     # nine digits tell all 32-bit numbers apart; no -0
     rows = [[float(f"{value + 0:.9g}") for value in row] for row in camera_to_world]

@@ -1,14 +1,15 @@
 r"""3D Gaussian splats as a layer of a depth composite.
 
-Along a ray o + t w, splat i with centre c, standard deviations s and rotation R has
-its peak at the distance t_i where ``m(t) = |diag(1/s) R^T (o + t w - c)|`` is least,
-and there the opacity ``a_i = min(opacity_i exp(-m(t_i)^2 / 2), 0.9999)``; it is left
-out where ``m(t_i) > 3``. Splats are laid over each other in the order of t_i, as if
-each were a thin sheet there: ``I = sum_i c_i a_i prod_{j<i} (1 - a_j)``, likewise the
-opacity, and the depth moment with t_i in place of c_i. Splats whose peak lies behind
-the origin or beyond the end of the ray are not seen; one that contains the origin is.
-The colour c_i is that of the direction from the origin to the centre, as where splats
-are trained.
+Let splat i have the centre c, standard deviations s and rotation R. Along a ray o + t w
+the splat has its peak at the distance t_i where
+``m(t) = |diag(1/s) R^T (o + t w - c)|`` is least. Its opacity there is
+``a_i = min(opacity_i exp(-m(t_i)^2 / 2), 0.9999)``; it is left out where
+``m(t_i) > 3``. Splats are laid over each other in the order of t_i, as if each were a
+thin sheet there: ``I = sum_i c_i a_i prod_{j<i} (1 - a_j)``. The opacity is this sum
+with 1 instead of c_i, and the depth moment is this sum with t_i instead of c_i. Splats
+whose peak lies behind the origin or beyond the end of the ray are not seen; a splat
+that contains the origin is seen. The colour c_i is the splat's colour in the direction
+from the origin to the centre, as in the training of splats.
 
 A march rasterises: rays are sorted into small cells of directions (`charts`), splats
 into the cells in which they may be seen (`pairs`), and a ray blends the list of its
@@ -57,9 +58,10 @@ _THINNEST = 1e-4  # standard deviation, of the splat's largest
 class SplatBackground(AbstractBackdrop):
     """Splats at a pose in the world.
 
-    Splats thinner than a ten-thousandth of their width count as that thick. Cost of a
-    march: a look at each splat for each origin of rays, the sort of the pairs of cells
-    and splats, and for each ray the list of its cell until the ray ends.
+    A splat thinner than a ten-thousandth of its width gets this thickness. The cost of
+    a march has three parts. It tests each splat for each origin of rays, sorts the
+    pairs of cells and splats, and follows the list of its cell for each ray until the
+    ray ends.
 
     Args:
         splats: from :func:`.load_splats`.

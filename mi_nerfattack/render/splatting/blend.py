@@ -96,8 +96,8 @@ def replay(
     """Replay :func:`blend`, and propagate derivatives by shades and by rays.
 
     With ``w_i`` the weight and ``T_i`` the transmittance before splat i:
-    ``dI/dc_i = w_i``, ``dI/da_i = T_i c_i - sum_{j>i} w_j c_j / (1 - a_i)``, and
-    likewise of opacity and moment.
+    ``dI/dc_i = w_i``, ``dI/da_i = T_i c_i - sum_{j>i} w_j c_j / (1 - a_i)``. Opacity
+    and moment have the same form.
 
     Returns:
         the tangent of the march, and the derivatives by origin and direction.

@@ -71,8 +71,8 @@ class Sorted:
 
     Attributes:
         charts: of the rays.
-        chart: (n,), each ray's.
-        cell: (n,), likewise.
+        chart: (n,), chart of each ray.
+        cell: (n,), cell of each ray.
         order: (n,), the rays' numbers by cell.
         cells: number of all cells.
         occupied: (cells,), 1 where there is a ray.

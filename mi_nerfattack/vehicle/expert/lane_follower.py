@@ -164,14 +164,14 @@ def future_positions(
     period: float,
     wheelbase: float,
 ) -> np.ndarray:
-    """Drive with an expert from several poses, and return where it comes.
+    """Drive with an expert from several poses, and return the future positions.
 
     The vehicle is kinematic: its speed is constant, its wheels answer at once, and it
     holds the control of each period. So it moves along arcs, which are exact here.
 
     Args:
         expert: gives the control at the start of each period.
-        poses: (n, 3), x and y in metres, heading in radians; may be beside the lane.
+        poses: (n, 3), x and y in metres, heading in radians; may be outside the lane.
         times: k times ahead, seconds, at least 0.
         speed: metres per second.
         period: seconds that a control is held.

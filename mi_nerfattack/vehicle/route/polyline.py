@@ -37,12 +37,13 @@ class Operations:
 
 
 class Segment(NamedTuple):
-    """Segments of a polyline, each entry an array of one number a segment.
+    """Segments of a polyline; each entry is an array with one number per segment.
 
-    `low` and `high` bound the distance from the start along the segment, metres:
-    0 and its length where it is joined to another, infinite at the ends of an open
-    polyline, which goes on straight. The directions `start_` and `end_` halve the
-    bends to its neighbours; `lap` is the length of a loop, infinite of an open one.
+    `low` and `high` bound the distance from the start along the segment, metres. They
+    are 0 and the segment's length where another segment joins, and infinite at the ends
+    of an open polyline, which goes on straight. The directions `start_` and `end_`
+    halve the bends to the neighbours. `lap` is the length of a closed polyline;
+    infinite for an open one.
     """
 
     x: Any
@@ -129,15 +130,16 @@ def square_distance(ops: Operations, segment: Segment, x: Any, y: Any) -> Any:
 def measure(ops: Operations, segment: Segment, x: Any, y: Any, theta: Any) -> Measures:
     """Measure vehicles against their nearest segments.
 
-    Beside a segment the arc length grows with the way along it. Outside of a bend,
-    where the vertex is nearest, arc length and direction are the vertex's, those of
-    half the bend, and the error is the distance from it.
+    Along a segment, the arc length grows with the distance from the segment's start. On
+    the outer side of a bend the vertex is nearest. There the arc length is the arc
+    length at the vertex, the direction is the one that halves the bend, and the error
+    is the distance from the vertex.
 
     Args:
         ops: functions of the arrays' library.
         segment: each entry (n,), constants.
         x: metres, (n,).
-        y: likewise.
+        y: metres, (n,).
         theta: heading, radians, (n,).
 
     Returns:

@@ -53,15 +53,16 @@ def check_held(enable: AbstractEnable) -> None:
 class JoystickEnable(AbstractEnable):
     """A button of a joystick or gamepad by Linux's ``/dev/input/js0``.
 
-    The driver tells changes alone: a wireless pad that is out of reach tells nothing,
-    and its button stays as it was. docs/car/reference.md says which pads will do.
+    The driver reports changes only. So a wireless pad that is out of reach reports
+    nothing, and its button stays as it was. docs/car/reference.md says which
+    pads you can use.
 
     Args:
         path: of the device.
         button: its number, from 0; ``jstest`` shows it.
         clock: of the loop.
-        silence_s: after which without any event the button counts as let go, until it
-            is pressed anew; None where the link cannot break unseen.
+        silence_s: after so many seconds without any event the button counts as let go,
+            until it is pressed again; None where the link cannot break unseen.
         inputs: where Linux describes its input devices.
 
     Raises:
@@ -92,9 +93,9 @@ class JoystickEnable(AbstractEnable):
             self._descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
 
     def is_held(self) -> bool:
-        """Whether the button is down, by all that has come up to now.
+        """Whether the button is down, by all events that have come up to now.
 
-        After a silence it must be pressed anew.
+        After a silence the button must be pressed again.
         """
         silence_s = self._silence_s
         if silence_s is not None and self._clock() - self._heard_s > silence_s:
