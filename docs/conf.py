@@ -65,6 +65,7 @@ CONTENTS = (
     "notebooks/index",
     "tutorials/index",
     "results/findings/index",
+    "dev/extend/index",
 )
 # The site shows these files as pages; in the repository a page links to each.
 CARDS = {

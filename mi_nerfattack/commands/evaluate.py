@@ -142,7 +142,7 @@ class Evaluate:
         """Check everything that can be checked before the first drive."""
         from mi_nerfattack.drives.store import Store
         from mi_nerfattack.evaluation.work import EvaluateDrives, check_policy
-        from mi_nerfattack.scenario.section import misfit
+        from mi_nerfattack.scenario.policy.base import misfit
         from mi_nerfattack.scenario.world import at_own_speed
 
         file = PolicyFile.read(self.policy, self.settings)
@@ -219,16 +219,18 @@ class Evaluate:
             session.close()
 
     def _environments(self) -> tuple[EnvironmentUnder, ...]:
-        from mi_nerfattack.deploy.registry import ENVIRONMENTS
+        from mi_nerfattack.deploy.registry import ENVIRONMENTS, offered_environment
 
         _check_different("--environments", self.environments)
         known = [name for name in ENVIRONMENTS if name != "replay"]
         for name in self.environments:
-            if name not in known:
+            if name == "replay":
                 raise InputError(
                     f"--environments: {name!r}; one of {', '.join(known)} (a recording "
                     "does not answer to a policy)"
                 )
+            if name not in known:
+                offered_environment(name, "--environments: ", known)
         self.where.check(self.environments)
         return parse_conditions(self.environments, self.conditions, self.spp)
 

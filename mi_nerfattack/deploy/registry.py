@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from inspect import signature
+from typing import TYPE_CHECKING, Any
 
 from mi_nerfattack.deploy.built_in import built_in_shapes
 from mi_nerfattack.deploy.environment import AbstractEnvironment
@@ -19,6 +21,9 @@ from mi_nerfattack.fields.io import load_field
 from mi_nerfattack.render.pathtrace.load import load_scene, set_daylight
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.vehicle.dynamics import Ackermann, Dubins
+
+if TYPE_CHECKING:
+    from mi_nerfattack.system.entry_points import Offer
 
 
 def kinematic_vehicle(place: Place) -> KinematicVehicle:
@@ -171,7 +176,7 @@ _CARLA_WEATHER = {
 }
 
 #: What makes an environment of a place under conditions, by name.
-ENVIRONMENTS: Mapping[str, Callable[[Place, Conditions], AbstractEnvironment]] = {
+ENVIRONMENTS: Mapping[str, Callable[..., AbstractEnvironment]] = {
     "surrogate": _surrogate,
     "mitsuba": _mitsuba,
     "mujoco": _mujoco,
@@ -181,28 +186,68 @@ ENVIRONMENTS: Mapping[str, Callable[[Place, Conditions], AbstractEnvironment]] =
 }
 
 
+def offered_environment(
+    name: str, where: str = "environment: ", known: Iterable[str] = ()
+) -> Offer:
+    """Return the function of another package that makes an environment.
+
+    Args:
+        name: of the environment.
+        where: begins the message of an unknown name.
+        known: names of this package, for the message; all by default.
+
+    Raises:
+        InputError: unknown name, or a package that cannot be imported.
+    """
+    from mi_nerfattack.system import entry_points
+
+    group, known = entry_points.ENVIRONMENTS, known or ENVIRONMENTS
+    offer = entry_points.find(group, name, known, where)
+    if not callable(offer.value):
+        raise offer.refuse(f"is {offer.value!r}, no function")
+    return offer
+
+
 def make_environment(
-    name: str, place: Place, conditions: Conditions | None = None
+    name: str,
+    place: Place,
+    conditions: Conditions | None = None,
+    settings: Mapping[str, Any] | None = None,
 ) -> AbstractEnvironment:
     """Make an environment.
 
     Args:
-        name: key of `ENVIRONMENTS`.
+        name: key of `ENVIRONMENTS`, or an environment of another package.
         place: its files.
         conditions: of light and camera; those of the files unless given.
+        settings: further arguments of the function of another package.
 
     Raises:
         InputError: unknown name, a package that is not installed, a file that is
-            missing or cannot be read.
+            missing or cannot be read, or a function that makes no environment.
     """
-    if name not in ENVIRONMENTS:
-        known = ", ".join(ENVIRONMENTS)
-        raise InputError(f"environment: {name!r}; one of {known}")
     conditions = conditions or Conditions()
-    environment = ENVIRONMENTS[name](place, conditions)
+    make, settings = ENVIRONMENTS.get(name), settings or {}
+    if make is None:
+        make = offered_environment(name).value
+        try:
+            signature(make).bind(place, conditions, **settings)
+        except TypeError as err:
+            raise InputError(
+                f"environment: {name!r}: {err}; drive there by a scenario, whose "
+                "[deployment] gives it"
+            ) from err
+    environment = make(place, conditions, **settings)
+    if not isinstance(environment, AbstractEnvironment):
+        raise InputError(
+            f"environment: {name!r}: its package makes {type(environment).__name__}; "
+            "its function must return an AbstractEnvironment"
+        )
     if isinstance(environment, AbstractSimulation):
         environment.blur_px = conditions.blur_px
         environment.noise_sd = conditions.noise_sd
+    else:
+        _refuse_disturbed(name, conditions)
     return environment
 
 
@@ -210,8 +255,10 @@ def environment_versions(name: str) -> dict[str, str]:
     """Return the versions of packages that one deployment environment needs.
 
     Args:
-        name: key of `deploy.registry.ENVIRONMENTS`.
+        name: key of `ENVIRONMENTS`, or an environment of another package.
     """
+    if name not in ENVIRONMENTS:
+        return {name: offered_environment(name).package}
     found = {}
     for package in _NEEDED.get(name, ()):
         try:

@@ -18,6 +18,7 @@ from mi_nerfattack.deploy.registry import (
     ENVIRONMENTS,
     environment_versions,
     make_environment,
+    offered_environment,
 )
 from mi_nerfattack.deploy.roadside.surroundings import Surroundings
 from mi_nerfattack.deploy.vehicle import Motion
@@ -129,7 +130,7 @@ class PlaceSite(AbstractSite):
     """A registered environment of a place.
 
     Args:
-        name: key of `deploy.registry.ENVIRONMENTS`.
+        name: key of `deploy.registry.ENVIRONMENTS`, or of another package.
         place: files, camera, car.
         weather: conditions of the shards.
         motion: makes the place's motion where an environment is opened: no process can
@@ -145,9 +146,7 @@ class PlaceSite(AbstractSite):
 
     def __post_init__(self) -> None:
         if self.name not in ENVIRONMENTS:
-            raise InputError(
-                f"environment: {self.name!r}; one of {', '.join(ENVIRONMENTS)}"
-            )
+            offered_environment(self.name)
         if self.name == SURROGATE and self.place.field is None:
             raise InputError(
                 f"environment {SURROGATE!r}: the place has no field; make one with "

@@ -51,6 +51,7 @@ class AbstractMethod(Section):
     """A way to search."""
 
     needs_derivatives: ClassVar[bool]
+    group: ClassVar[str] = "mi_nerfattack.methods"
 
     @abstractmethod
     def build(self, task: Task) -> AbstractAttack:
@@ -181,13 +182,13 @@ class AbstractSearchMethod(AbstractMethod):
                 "attack.freedom.kind: searches change textures alone; set it to "
                 "'texture', or attack.method.kind to 'gradient'"
             )
-        search = self._search(task)
+        search = self.search(task)
         parts = task.rollout, task.route, task.initial, task.freedom
         return SurrogateSearch(search, *parts, self.frames)
 
     @abstractmethod
-    def _search(self, task: Task) -> AbstractSearch:
-        """Make what proposes textures."""
+    def search(self, task: Task) -> AbstractSearch:
+        """Make what proposes textures; it draws from the task's seed alone."""
 
     def iterations(self, frames: int) -> int:
         """See :meth:`AbstractMethod.iterations`."""
@@ -200,7 +201,7 @@ class RandomMethod(AbstractSearchMethod):
     kind: Literal["random"]
     texture_kind: Literal["noise", "blobs", "flat", "mixed"] = "mixed"
 
-    def _search(self, task: Task) -> AbstractSearch:
+    def search(self, task: Task) -> AbstractSearch:
         fields = task.fields
         seed = task.seed + (1 << 31)  # other draws than those of the baseline
         return RandomSearch(RandomLooks(fields, task.freedom, self.texture_kind, seed))
@@ -212,11 +213,11 @@ class BlockMethod(AbstractSearchMethod):
     kind: Literal["blocks"]
     first_block: SomeShare = 0.3  # of the lattice
 
-    def _search(self, task: Task) -> AbstractSearch:
+    def search(self, task: Task) -> AbstractSearch:
         proposals = self.iterations(task.frames)
         fields = task.fields
         rest = proposals, self.first_block, task.seed
-        return BlockSearch(_colourings(task), fields, *rest)
+        return BlockSearch(task.colourings, fields, *rest)
 
 
 class EvolutionMethod(AbstractSearchMethod):
@@ -228,10 +229,10 @@ class EvolutionMethod(AbstractSearchMethod):
     spread: Positive = 0.3  # of the first samples, sRGB
     population: Population | None = None
 
-    def _search(self, task: Task) -> AbstractSearch:
+    def search(self, task: Task) -> AbstractSearch:
         from mi_nerfattack.attack.black_box.evolution import EvolutionSearch
 
-        basis = LowFrequency(_colourings(task), self.coefficients)
+        basis = LowFrequency(task.colourings, self.coefficients)
         rest = self.variant, self.spread, self.population, task.seed
         return EvolutionSearch(basis, *rest)
 
@@ -242,16 +243,11 @@ class BayesianMethod(AbstractSearchMethod):
     kind: Literal["bayesian"]
     coefficients: Annotated[int, Field(ge=1, le=64)] = 64  # of all objects, at most
 
-    def _search(self, task: Task) -> AbstractSearch:
+    def search(self, task: Task) -> AbstractSearch:
         from mi_nerfattack.attack.black_box.bayesian import BayesianSearch
 
-        basis = LowFrequency(_colourings(task), self.coefficients)
+        basis = LowFrequency(task.colourings, self.coefficients)
         return BayesianSearch(basis, seed=task.seed)
-
-
-def _colourings(task: Task) -> list[Colours]:
-    found = [task.freedom.colouring(field) for field in task.fields]
-    return [item for item in found if isinstance(item, Colours)]  # which all are
 
 
 MethodSection = Annotated[
@@ -261,7 +257,7 @@ MethodSection = Annotated[
     | BlockMethod
     | EvolutionMethod
     | BayesianMethod,
-    Kinds("gradient"),
+    Kinds("gradient", AbstractMethod),
 ]
 
 

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from inspect import Parameter, signature
+from typing import Annotated, Any, ClassVar, Literal, get_type_hints
 from weakref import WeakKeyDictionary
 
-from pydantic import Discriminator, Field, Tag
+from pydantic import Discriminator, Field, Tag, create_model
 
 from mi_nerfattack.deploy.built_in import BuiltInObject, make_built_in
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.place import Conditions, Place
-from mi_nerfattack.deploy.registry import make_environment
+from mi_nerfattack.deploy.registry import make_environment, offered_environment
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.io.resumable import array_digest
 from mi_nerfattack.ranges import Count, Finite, NonNegative
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.scenario.named_file import FileOrFolder
-from mi_nerfattack.scenario.section import UNTAGGED, Kinds, Section
+from mi_nerfattack.scenario.section import UNTAGGED, Kinds, Section, read_offered
 
 #: Name of the environment of attacks.
 SURROGATE = "surrogate"
@@ -37,10 +38,34 @@ class AbstractDeploymentSection(Section):
     """What all have: a name, under which results stand; by default the kind."""
 
     name: Label | None = None
+    group: ClassVar[str] = "mi_nerfattack.environments"
 
     def place(self, place: Place) -> Place:
         """Add what this environment needs of a place."""
         return place
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Further arguments of what makes the environment."""
+        return {}
+
+    @classmethod
+    def offered(cls, name: str, known: Iterable[str]) -> tuple[type[Section], str]:
+        """Make a section of the further arguments of another package's function.
+
+        Raises:
+            InputError: no package offers it, or an argument has no type.
+        """
+        offer = offered_environment(name, "is ", known)
+        parameters = dict(list(signature(offer.value).parameters.items())[2:])
+        hints = get_type_hints(offer.value, include_extras=True)
+        keys: dict[str, Any] = {"kind": (Literal[name], ...)}
+        for key, parameter in parameters.items():
+            if key not in hints or key in OfferedDeployment.model_fields:
+                raise offer.refuse(f"argument {key!r} has no type, or is taken")
+            is_needed = parameter.default is Parameter.empty
+            keys[key] = (hints[key], ... if is_needed else parameter.default)
+        return create_model(name, __base__=OfferedDeployment, **keys), offer.package
 
 
 class AbstractSimulatedDeployment(AbstractDeploymentSection):
@@ -50,17 +75,22 @@ class AbstractSimulatedDeployment(AbstractDeploymentSection):
     exposure_ev: Finite = 0.0
     blur_px: NonNegative = 0.0
     noise_sd: NonNegative = 0.0
+
+
+class AbstractMeshDeployment(AbstractSimulatedDeployment):
+    """The meshes of the scene, among which objects can be built in."""
+
     objects: Objects = "pasted"
 
 
-class RenderedDeployment(AbstractSimulatedDeployment):
+class RenderedDeployment(AbstractMeshDeployment):
     """Images by Mitsuba; `mujoco` drives a car with wheels."""
 
     kind: Literal["mitsuba", "mujoco"] = "mitsuba"
     spp: Count = 16
 
 
-class RasterisedDeployment(AbstractSimulatedDeployment):
+class RasterisedDeployment(AbstractMeshDeployment):
     """Images by MuJoCo, and its car with wheels."""
 
     kind: Literal["mujoco_gl"]
@@ -91,9 +121,28 @@ class ReplayDeployment(AbstractDeploymentSection):
         return replace(place, recording=self.recording.file, topics=self.topics)
 
 
+class OfferedDeployment(AbstractSimulatedDeployment):
+    """An environment of another package; `AbstractDeploymentSection.offered` adds keys.
+
+    Objects are pasted.
+    """
+
+    spp: Count = 16
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The keys that are arguments of the package's function."""
+        ours = {*OfferedDeployment.model_fields, "kind"}
+        return {key: value for key, value in self if key not in ours}
+
+    def __reduce__(self) -> Any:
+        """Let another process make the class again, which no module has."""
+        return read_offered, (AbstractDeploymentSection, dict(self))
+
+
 DeploymentSection = Annotated[
     RenderedDeployment | RasterisedDeployment | CarlaDeployment | ReplayDeployment,
-    Kinds("mitsuba"),
+    Kinds("mitsuba", AbstractDeploymentSection),
 ]
 _Several = Annotated[tuple[DeploymentSection, ...], Field(min_length=1)]
 #: A table, or an array of tables.
@@ -115,17 +164,19 @@ class Deployment:
     """An environment that can be opened with objects in it.
 
     Attributes:
-        environment: key of `deploy.registry.ENVIRONMENTS`.
+        environment: key of `deploy.registry.ENVIRONMENTS`, or of another package.
         place: where.
         conditions: of light and camera.
         builds_in: objects become geometry of the scene, so that those of another look
             need another environment; otherwise they are shown as fields.
+        settings: further arguments of the function of another package.
     """
 
     environment: str
     place: Place
     conditions: Conditions
     builds_in: bool
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def is_open_loop(self) -> bool:
@@ -151,11 +202,15 @@ class Deployment:
                 (p.field, p.placed) for p in objects if isinstance(p.field, GridField)
             ]
             built_in = tuple(_built_in(*item) for item in grids)
-            conditions = replace(self.conditions, built_in=built_in)
-            return make_environment(self.environment, self.place, conditions)
-        environment = make_environment(self.environment, self.place, self.conditions)
+            return self._make(replace(self.conditions, built_in=built_in))
+        environment = self._make(self.conditions)
         environment.show(objects)
         return environment
+
+    def _make(self, conditions: Conditions) -> AbstractEnvironment:
+        return make_environment(
+            self.environment, self.place, conditions, settings=self.settings
+        )
 
 
 def _built_in(field: GridField, pose: Pose) -> BuiltInObject:
@@ -183,5 +238,7 @@ def deployments(given: DeploymentSections, place: Place) -> Mapping[str, Deploym
         names = ("sky", "exposure_ev", "spp", "blur_px", "noise_sd")
         conditions = Conditions(**{n: values[n] for n in names if n in values})
         builds_in, there = values.get("objects") == "built-in", section.place(place)
-        found[label] = Deployment(section.kind, there, conditions, builds_in)
+        found[label] = Deployment(
+            section.kind, there, conditions, builds_in, section.settings
+        )
     return found

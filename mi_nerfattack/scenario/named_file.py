@@ -76,7 +76,8 @@ class NamedFile:
 
         An XML file counts with the files that it and included ones name, a Python file
         with its `helper_files`, the folder of a recording with all that lies in it. Of
-        an installed module, its own source counts; the name where it has none.
+        an installed module, its own source counts; the name where it has none. Other
+        packages whose plugins an XML file names count, too: ``packages`` names them.
 
         Raises:
             InputError: the file cannot be read.
@@ -88,17 +89,21 @@ class NamedFile:
             return {"file": self.name, "sha256": digest.hexdigest()}
         if os.path.isdir(self.path):  # never raises; Path.is_dir may
             return {"file": self.path.name, "sha256": _folder_digest(self.path)}
-        raw = _read(self.path)
+        raw, found = _read(self.path), dict[str, str]()
         digest = hashlib.sha256(raw)
         digest.update(self.function.encode())
         if self.path.suffix.lower() == ".xml":
-            for inner in _files_of(self.path):
+            inner_files, packages = _files_of(self.path)
+            for inner in inner_files:
                 digest.update(hashlib.sha256(_read(inner)).digest())
+            if packages:
+                digest.update(packages.encode())
+                found["packages"] = packages
         if self.function:
             for name, helper in sorted(helper_files(self.path).items()):
                 digest.update(f"{name} {files.sha256(helper)}\n".encode())
         shown = ":".join(filter(None, (self.path.name, self.function)))
-        return {"file": shown, "sha256": digest.hexdigest()}
+        return {"file": shown, "sha256": digest.hexdigest(), **found}
 
 
 def _path(value: Any, info: ValidationInfo) -> NamedFile:
@@ -143,13 +148,17 @@ def _any_code(value: Any, info: ValidationInfo) -> NamedFile:
     return NamedFile(str(value), None)
 
 
-def _files_of(scene: Path) -> list[Path]:
-    """Return the files that a Mitsuba scene names, in the order of their names."""
+def _files_of(scene: Path) -> tuple[list[Path], str]:
+    """Return the files that a Mitsuba scene names, by name, and packages of plugins."""
     from mi_nerfattack.backend import variant
-    from mi_nerfattack.render.pathtrace.load import named_files  # slow to import
+    from mi_nerfattack.render.pathtrace.load import (  # slow to import
+        named_files,
+        plugin_packages,
+    )
 
     variant.ensure()
-    return [path for _, path in sorted(named_files(scene).items())]
+    paths = [path for _, path in sorted(named_files(scene).items())]
+    return paths, plugin_packages(scene)
 
 
 def _folder_digest(folder: Path) -> str:
@@ -183,7 +192,7 @@ def section_content(section: Section) -> dict[str, Any]:
         if isinstance(value, NamedFile):
             values.pop(str(key))
             values[f"{key}_sha256"] = value.content()["sha256"]
-    return values
+    return values | ({"package": section.package} if section.package else {})
 
 
 def portable_text(section: Section, text: str) -> str:

@@ -36,12 +36,12 @@ from mi_nerfattack.scenario.deployment import (
 from mi_nerfattack.scenario.named_file import File, NamedFile, portable_text
 from mi_nerfattack.scenario.objective import ObjectiveSection
 from mi_nerfattack.scenario.objects import FieldObjectSection, ObjectSection, Triple
+from mi_nerfattack.scenario.policy.base import misfit
 from mi_nerfattack.scenario.policy.kinds import PolicySection, build_differentiable
 from mi_nerfattack.scenario.section import (
     CameraSection,
     NamedCameraSection,
     Section,
-    misfit,
     problems,
     refuse,
     rig_of,
@@ -249,7 +249,7 @@ class Scenario(Section):
                 f"environments called {labels}; give each a name of its own, which is "
                 f"not {SURROGATE}",
             )
-        if model == "custom":
+        if model == "custom" or self.vehicle.unit == "other":
             for label, section in sections:
                 if section.kind.startswith("mujoco"):
                     refuse(

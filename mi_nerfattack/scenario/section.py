@@ -8,7 +8,7 @@ because a real car reads it, too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, is_dataclass, replace
 from inspect import signature
 from pathlib import Path
@@ -30,9 +30,11 @@ from pydantic import (
     Field,
     GetCoreSchemaHandler,
     GetJsonSchemaHandler,
+    PrivateAttr,
     Tag,
     TypeAdapter,
     ValidationError,
+    ValidationInfo,
     WrapValidator,
     model_validator,
 )
@@ -52,14 +54,13 @@ from mi_nerfattack.render.camera.rig import Rig
 
 Trust = Annotated[bool, Field(exclude=True)]  # results do not depend on it
 
-
 #: Of a control: a heading rate, a steering angle, or another quantity.
 Unit = Literal["rad/s", "rad", "other"]
-Turn = Annotated[float, Field(ge=-180, le=180)]  # of a camera, degrees
 
 #: Keys and indices that lead to a value of the file.
 Location = tuple[str | int, ...]
 
+_Reader = Callable[[Any], Any]
 _WORDS = {"tuple_type": "must be an array", "model_type": "must be a table"}
 _UNKNOWN = ("unknown", "unexpected_keyword_argument")
 _WORDS |= {"model_attributes_type": "must be a table", "missing": "is missing"}
@@ -73,11 +74,27 @@ class Section(BaseModel):
     )
     #: Keys that do not count at their defaults: digests from before them stay.
     later: ClassVar[tuple[str, ...]] = ()
+    #: Entry points by which other packages offer kinds; "" where they cannot.
+    group: ClassVar[str] = ""
+    _package: str = PrivateAttr("")
 
     @classmethod
     def defaults(cls) -> dict[str, Any]:
         """Return the keys of the table and their defaults."""
         return {name: field.default for name, field in cls.model_fields.items()}
+
+    @property
+    def package(self) -> str:
+        """Name and version of the other package that offers this kind, or ""."""
+        return self._package
+
+    @classmethod
+    def offered(cls, name: str, known: Iterable[str]) -> tuple[type[Section], str]:
+        """Return another package's class, and the package; as `find`, it raises."""
+        from mi_nerfattack.system import entry_points
+
+        offer = entry_points.find(cls.group, name, known)
+        return offer.subclass(cls, name), offer.package
 
     def leaves(self) -> Iterator[tuple[Location, Any]]:
         """Yield the location of each value that counts, and the value."""
@@ -85,7 +102,7 @@ class Section(BaseModel):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _read(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
+    def _read(cls, data: Any, handler: _Reader) -> Any:
         """Make tuples of lists, which strict models take; say which keys there are."""
         if not isinstance(data, dict):
             return handler(data)
@@ -100,7 +117,7 @@ class Section(BaseModel):
         return _reworded(lambda: handler(_frozen(data)), reword)
 
 
-def _untagged(data: Any, read: Callable[[Any], Any]) -> Any:
+def _untagged(data: Any, read: _Reader) -> Any:
     def reword(error: ErrorDetails) -> tuple[str, Location, str]:
         return error["type"], error["loc"][1:], error["msg"]
 
@@ -118,21 +135,22 @@ class Kinds:
     Args:
         default: the kind of a table without the key; or a function that derives the
             kind from the other keys.
+        family: section whose `group` names entry points of further kinds.
     """
 
     default: str | Callable[[dict[str, Any]], str] | None = None
+    family: type[Section] = Section
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
         """Return a schema that chooses by the kind, and always writes it."""
         union = Annotated[source, Field(discriminator="kind")]
-        return core_schema.no_info_wrap_validator_function(
-            lambda data, read: self._read(get_args(source), data, read),
+        return core_schema.with_info_wrap_validator_function(
+            lambda data, read, info: self._read(get_args(source), data, read, info),
             handler.generate_schema(union),
             serialization=core_schema.wrap_serializer_function_ser_schema(
-                lambda value, write: {"kind": value.kind} | write(value),
-                schema=handler.generate_schema(union),
+                _written, info_arg=True, schema=handler.generate_schema(union)
             ),
         )
 
@@ -149,11 +167,18 @@ class Kinds:
         return {"oneOf": [*([{"$ref": default}] if default else []), *kinds]}
 
     def _read(
-        self, members: tuple[Any, ...], data: Any, read: Callable[[Any], Any]
+        self, members: tuple[Any, ...], data: Any, read: _Reader, info: ValidationInfo
     ) -> Any:
         if isinstance(data, dict) and data.get("kind") is None:
             kind = self.default(data) if callable(self.default) else self.default
             data = {"kind": kind, **{k: v for k, v in data.items() if k != "kind"}}
+        known = [kind for member in members for kind in _kinds_of(member)]
+        kind = data["kind"] if isinstance(data, dict) else getattr(data, "kind", None)
+        if self.family.group and isinstance(kind, str) and kind not in known:
+            try:
+                return read_offered(self.family, data, known, info.context)
+            except InputError as err:
+                refuse("kind", str(err))
 
         def reword(error: ErrorDetails) -> tuple[str, Location, str]:
             what, location, message = error["type"], error["loc"], error["msg"]
@@ -166,6 +191,27 @@ class Kinds:
             return what, location[1:], message
 
         return _reworded(lambda: read(data), reword)
+
+
+def read_offered(
+    family: type[Section], data: Any, known: Iterable[str] = (), context: Any = None
+) -> Any:
+    """Make a section of another package of a table; see :meth:`Section.offered`."""
+    if isinstance(data, family):
+        return data
+    kind, package = family.offered(data["kind"], known)
+    section = kind.model_validate(data, context=context)
+    section._package = package
+    return section
+
+
+def _written(value: Any, write: _Reader, info: Any) -> dict[str, Any]:
+    """Write a section with its kind, whatever its defaults."""
+    kind, how = {"kind": value.kind}, {"exclude_defaults": info.exclude_defaults}
+    if isinstance(value, Section) and value.package:  # no member of the union
+        values = value.model_dump(mode=info.mode, **how)
+        return kind | values | {"package": value.package}
+    return kind | write(value)
 
 
 _T = TypeVar("_T")
@@ -212,7 +258,7 @@ def _told(members: tuple[Any, ...], what: str, kind: str, key: str) -> str:
 
 
 def _kinds_of(member: Any) -> tuple[str, ...]:
-    return get_args(get_type_hints(member)["kind"])
+    return get_args(get_type_hints(member).get("kind"))
 
 
 def _error(
@@ -250,11 +296,8 @@ def problems(err: ValidationError) -> Iterator[tuple[Location, str]]:
         if kind == "too_short" and location in lists:
             continue  # its only item is wrong, and told
         message = _WORDS.get(kind, error["msg"])
-        given = (
-            ""
-            if kind in ("told", "unknown", "missing")
-            else f" (is {error['input']!r})"
-        )
+        is_worded = kind in ("told", "unknown", "missing")
+        given = "" if is_worded else f" (is {error['input']!r})"
         yield location, message[0].lower() + message[1:] + given
 
 
@@ -264,6 +307,7 @@ def _leaves(location: Location, value: Any) -> Iterator[tuple[Location, Any]]:
         keys, usual = type(value).model_fields.items(), value.defaults()
         inner = [(k, getattr(value, k)) for k, field in keys if not field.exclude]
         inner = [(k, v) for k, v in inner if k not in value.later or v != usual[k]]
+        inner += [("package", value.package)] if value.package else []
     elif is_dataclass(value) and hasattr(value, "kind"):
         inner = list(vars(value).items())
     elif isinstance(value, tuple) and value and isinstance(value[0], Section):
@@ -280,37 +324,6 @@ def _frozen(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _frozen(item) for key, item in value.items()}
     return tuple(map(_frozen, value)) if isinstance(value, list) else value
-
-
-def misfit(given: str | None, taken: str | None, source: str) -> str:
-    """Say why a vehicle does not take a policy's control; nothing if it may.
-
-    Args:
-        given: unit of the policy's control; None where nothing says it.
-        taken: unit of the vehicle's control; None where nothing says it.
-        source: of the policy, for the message.
-    """
-    if None in (given, taken) or given == taken:
-        return ""
-    return (
-        f"takes {taken}, and {source} gives {given}; take another of them, or convert "
-        "the control by policy.control_scale"
-    )
-
-
-def check_count(given: int, names: Sequence[str]) -> None:
-    """Refuse a policy that gives more or fewer controls than its vehicle takes.
-
-    Args:
-        given: number of the policy's.
-        names: of the vehicle's.
-    """
-    if given != len(names):
-        refuse(
-            "policy.output",
-            f"the policy gives {given}, the vehicle takes {len(names)}: "
-            f"{', '.join(names)}; give a column for each",
-        )
 
 
 class AbstractCameraSection(Section):
@@ -331,7 +344,7 @@ class AbstractCameraSection(Section):
     forward_m: Finite = 0.5
     pitch_deg: Annotated[float, Field(gt=-90, lt=90)] = 6.0
     left_m: Finite = 0.0
-    yaw_deg: Turn = 0.0  # to the left
+    yaw_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0  # to the left
     later: ClassVar[tuple[str, ...]] = ("left_m", "yaw_deg")
     lens: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
@@ -375,7 +388,7 @@ class NamedCameraSection(AbstractCameraSection):
 CameraSections = Annotated[tuple[NamedCameraSection, ...], Field(min_length=1)]
 
 
-def rig_of(cameras: Sequence[NamedCameraSection]) -> Rig:
+def rig_of(cameras: tuple[NamedCameraSection, ...]) -> Rig:
     """Make what a vehicle with several cameras sees by.
 
     Raises:

@@ -23,13 +23,7 @@ from mi_nerfattack.scenario.section import (
     refuse,
 )
 from mi_nerfattack.vehicle.bicycle import KinematicBicycle, RateLimitedAckermann
-from mi_nerfattack.vehicle.dynamics import (
-    AbstractDynamics,
-    Ackermann,
-    Dubins,
-    to_control,
-    to_state,
-)
+from mi_nerfattack.vehicle.dynamics import AbstractDynamics, Ackermann, Dubins
 from mi_nerfattack.vehicle.integrators import (
     RK4,
     AbstractIntegrator,
@@ -37,7 +31,7 @@ from mi_nerfattack.vehicle.integrators import (
     ImplicitMidpoint,
 )
 from mi_nerfattack.vehicle.single_track import DynamicSingleTrack, KinematicSingleTrack
-from mi_nerfattack.vehicle.trial import require_model
+from mi_nerfattack.vehicle.trial import try_model
 from mi_nerfattack.vehicle.user_model import FunctionDynamics, user_controls
 
 INTEGRATORS: dict[str, type[AbstractIntegrator]] = {
@@ -51,8 +45,6 @@ _STABLE_RATIO = {"euler": 2.0, "rk4": 2.78, "implicit_midpoint": float("inf")}
 _FINE_RATIO, _MOST_SUBSTEPS = 0.4, 64
 #: The same that keeps a car calm which comes to rest.
 _CALM_RATIO = 2.0
-#: Vehicles with which a user's model is tried.
-TRIALS = 3
 
 SteerAngle = Annotated[float, Field(gt=0, lt=90)]
 
@@ -65,6 +57,7 @@ class AbstractVehicleSection(Section):
     substeps: Count = 1  # integration steps a control period
     delay_steps: Whole = 0  # integration steps
     width_m: Positive = 1.8
+    group: ClassVar[str] = "mi_nerfattack.vehicles"
 
     @abstractmethod
     def build(self) -> AbstractDynamics:
@@ -75,9 +68,17 @@ class AbstractVehicleSection(Section):
         """
 
     def motion(self) -> Motion:
-        """Make the model with its time step; see :meth:`build`."""
-        integrator = INTEGRATORS[self.integrator]()
-        return Motion(self.build(), integrator, self.substeps, self.delay_steps)
+        """Make the model with its time step; see :meth:`build`.
+
+        Raises:
+            InputError: the model of another package fails its trial.
+        """
+        model, integrator = self.build(), INTEGRATORS[self.integrator]()
+        if self.package:
+            car = self.car()
+            limits = (car.max_control, *(item.highest for item in car.more_controls))
+            try_model(f"vehicle.kind: {self.package}", model, limits)
+        return Motion(model, integrator, self.substeps, self.delay_steps)
 
     def car(self) -> Car:
         """Describe the car with wheels: of this width, other sizes in proportion.
@@ -88,7 +89,7 @@ class AbstractVehicleSection(Section):
         names = ("wheelbase", "length", "track", "wheel_radius")
         sizes = {name: size * getattr(CAR, name) for name in names}
         sizes |= {"width": self.width_m, "mass": CAR.mass * size**3}
-        return replace(CAR, **{**sizes, **self._handling()})
+        return replace(CAR, **{**sizes, **self.handling()})
 
     @property
     def unit(self) -> str | None:
@@ -102,8 +103,8 @@ class AbstractVehicleSection(Section):
         return self.unit in ("rad/s", "rad") and named in ([], ["acceleration"])
 
     @abstractmethod
-    def _handling(self) -> dict[str, Any]:
-        """Return what the model says about the car."""
+    def handling(self) -> dict[str, Any]:
+        """Return what the model says about the car: keys of `deploy.car.Car`."""
 
     def _divide(self, key: str, time_s: float, fine_ratio: float) -> None:
         """Take steps that are fine enough by default, and refuse those that diverge.
@@ -138,7 +139,7 @@ class DubinsSection(AbstractVehicleSection):
         """Make the model."""
         return Dubins(self.speed_ms, self.max_heading_rate)
 
-    def _handling(self) -> dict[str, Any]:
+    def handling(self) -> dict[str, Any]:
         return {"max_control": self.max_heading_rate}
 
 
@@ -155,7 +156,7 @@ class AckermannSection(AbstractVehicleSection):
         steer = float(np.radians(self.max_steer_deg))
         return Ackermann(self.speed_ms, self.wheelbase_m, steer)
 
-    def _handling(self) -> dict[str, Any]:
+    def handling(self) -> dict[str, Any]:
         return _steered(self.wheelbase_m, self.max_steer_deg)
 
 
@@ -183,7 +184,7 @@ class AckermannRateSection(AbstractVehicleSection):
             self.speed_ms, self.wheelbase_m, steer, rate, self.steer_time_s
         )
 
-    def _handling(self) -> dict[str, Any]:
+    def handling(self) -> dict[str, Any]:
         return _steered(self.wheelbase_m, self.max_steer_deg)
 
 
@@ -203,7 +204,7 @@ class BicycleSection(AbstractVehicleSection):
             self.speed_ms, self.front_axle_m, self.rear_axle_m, steer
         )
 
-    def _handling(self) -> dict[str, Any]:
+    def handling(self) -> dict[str, Any]:
         return _steered(self.front_axle_m + self.rear_axle_m, self.max_steer_deg)
 
 
@@ -253,7 +254,7 @@ class KinematicSingleTrackSection(AbstractSingleTrackSection):
         """See :class:`AbstractSingleTrackSection`."""
         return self.max_brake_ms2 / self.stop_speed_ms
 
-    def _handling(self) -> dict[str, Any]:
+    def handling(self) -> dict[str, Any]:
         return self._accelerated(self.wheelbase_m)
 
 
@@ -289,7 +290,7 @@ class DynamicSingleTrackSection(AbstractSingleTrackSection):
         """See :class:`AbstractSingleTrackSection`."""
         return self.build().fastest_rate
 
-    def _handling(self) -> dict[str, Any]:
+    def handling(self) -> dict[str, Any]:
         found = self._accelerated(self.front_axle_m + self.rear_axle_m)
         return found | {"mass": self.mass_kg}
 
@@ -355,19 +356,17 @@ class CustomSection(AbstractVehicleSection):
             from mi_nerfattack.vehicle.torch_model import TorchDynamics as kind
         function = self.function.load("vehicle.function", self.trust_code)
         limit = self.limits[0] if self.controls == 1 else self.limits
-        how = self.state_size, limit, self.rest_state, self.controls
-        dynamics = kind(function, *how)
-        rng = np.random.default_rng(0)
-        states = dynamics.extend(rng.normal(size=(TRIALS, 3)))
-        # Off the initial values of the other rows: there a model may have a kink.
-        states[:, 3:] += 1e-3 * rng.uniform(0.5, 1, (TRIALS, self.state_size - 3))
-        state = to_state(states)
-        shares = rng.uniform(0.1, 0.5, (self.controls, TRIALS))
-        control = to_control(shares.T * self.limits)
-        require_model(dynamics.name, dynamics, state, control)
+        dynamics = kind(
+            function,
+            size=self.state_size,
+            limit=limit,
+            rest=self.rest_state,
+            controls=self.controls,
+        )
+        try_model(dynamics.name, dynamics, self.limits)
         return dynamics
 
-    def _handling(self) -> dict[str, Any]:
+    def handling(self) -> dict[str, Any]:
         (limit, *others), wheelbase = self.limits, self.wheelbase_m
         steered = {"max_steer": limit} if self.control_unit == "rad" else {}
         sizes = {} if wheelbase is None else {"wheelbase": wheelbase}
@@ -396,5 +395,5 @@ VehicleSection = Annotated[
     | KinematicSingleTrackSection
     | DynamicSingleTrackSection
     | CustomSection,
-    Kinds("dubins"),
+    Kinds("dubins", AbstractVehicleSection),
 ]

@@ -2,20 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.vehicle.dynamics import AbstractDynamics
+from mi_nerfattack.vehicle.dynamics import AbstractDynamics, to_control, to_state
 from mi_nerfattack.vehicle.user_model import require_finite
 
 #: Step of the central differences, relative to one plus the magnitude.
 STEP = 1e-6
 #: Slope that a difference must show before a zero derivative is called wrong.
 VISIBLE = 1e-4
+#: Vehicles with which a model is tried.
+TRIALS = 3
+
+
+def try_model(name: str, dynamics: AbstractDynamics, limits: Sequence[float]) -> None:
+    """Try a model near the origin and its initial state; see :func:`require_model`.
+
+    Args:
+        name: of the model, for messages.
+        dynamics: the model.
+        limits: of each control, in its unit.
+    """
+    rng, size = np.random.default_rng(0), dynamics.state_size
+    states = dynamics.extend(rng.normal(size=(TRIALS, 3)))
+    # Off the initial values of the other rows: there a model may have a kink.
+    states[:, 3:] += 1e-3 * rng.uniform(0.5, 1, (TRIALS, size - 3))
+    shares = rng.uniform(0.1, 0.5, (len(limits), TRIALS))
+    control = to_control(shares.T * limits)
+    require_model(name, dynamics, to_state(states), control)
 
 
 def require_model(name: str, dynamics: AbstractDynamics, state: Any, u: Any) -> None:

@@ -69,6 +69,8 @@ SKIPPED = {
     "reference/commands": "writes into the home folder",
     "start/first_attack": LONG,
     "start/install": "installs",
+    "examples/package_template/README": "installs",
+    "dev/extend/condition": INPUT,
 }
 
 

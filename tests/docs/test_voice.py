@@ -28,7 +28,8 @@ PENDING = {
 }
 
 # The same for docstrings, by folder.
-PENDING_DOCSTRINGS = {}
+PENDING_DOCSTRINGS = {
+}
 
 
 @pytest.mark.parametrize("page", FOUND)

@@ -89,7 +89,7 @@ def test_a_look_is_built_in_once(monkeypatch):
     monkeypatch.setattr(
         deployment,
         "make_environment",
-        lambda name, place, conditions: opened.append(conditions.built_in),
+        lambda name, place, conditions, settings: opened.append(conditions.built_in),
     )
     field, there = homogeneous(400.0), Pose.upright((5.0, 1.0, 1.0), 0.5)
     texture = field.texture.numpy().copy()

@@ -21,6 +21,7 @@ from mi_nerfattack.attack.black_box.search import (
     Textures,
 )
 from mi_nerfattack.attack.plan import has_settled
+from mi_nerfattack.attack.texture.colours import Colours
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.rollout.function import Rollout
@@ -171,6 +172,12 @@ class Task:
     def fields(self) -> Sequence[GridField]:
         """Of the objects."""
         return textured(self.rollout.loop).fields
+
+    @property
+    def colourings(self) -> list[Colours]:
+        """What may change of the texture of each object."""
+        found = [self.freedom.colouring(field) for field in self.fields]
+        return [item for item in found if isinstance(item, Colours)]  # which all are
 
     @property
     def frames(self) -> int:

@@ -113,7 +113,7 @@ class PolicyFile:
         Raises:
             InputError: the policy's file and the section [vehicle] differ.
         """
-        from mi_nerfattack.scenario.section import misfit
+        from mi_nerfattack.scenario.policy.base import misfit
 
         section, vehicle = self.section, self.vehicle
         if vehicle is None or not vehicle.has_expert:
@@ -134,7 +134,11 @@ class PolicyFile:
         from mi_nerfattack.scenario.vehicle import CustomSection
 
         wheels = [name for name in environments if name.startswith("mujoco")]
-        if wheels and isinstance(self.vehicle, CustomSection):
+        vehicle = self.vehicle
+        is_custom = isinstance(vehicle, CustomSection) or (
+            vehicle is not None and vehicle.unit == "other"
+        )
+        if wheels and is_custom:
             raise InputError(
                 f"{option}: {wheels[0]} drives a car with wheels, whose control is not "
                 "that of a custom vehicle; leave it out"

@@ -39,11 +39,19 @@ class AbstractAround(AbstractEnvironment):
         self, route: Route, pose: np.ndarray | None = None, seed: int = 0
     ) -> CameraFrame:
         """Put the vehicle on the route's start, or elsewhere."""
-        return self._begin(self.inside.reset(route, pose, seed), seed)
+        return self.begin(self.inside.reset(route, pose, seed), seed)
 
     @abstractmethod
-    def _begin(self, frame: CameraFrame, seed: int) -> CameraFrame:
-        """Forget the drive before; what is seen first of the first frame."""
+    def begin(self, frame: CameraFrame, seed: int) -> CameraFrame:
+        """Forget the drive before.
+
+        Args:
+            frame: of the environment inside, after its reset.
+            seed: of what is random until the next reset.
+
+        Returns:
+            the first frame of the drive.
+        """
 
     @property
     def state(self) -> np.ndarray:
@@ -86,7 +94,8 @@ class LateFrames(AbstractAround):
         self._frames.append(self.inside.step(control))
         return self._frames[0]
 
-    def _begin(self, frame: CameraFrame, seed: int) -> CameraFrame:
+    def begin(self, frame: CameraFrame, seed: int) -> CameraFrame:
+        """Forget the drive before; see the family."""
         del seed
         self._frames.extend([frame] * (self._frames.maxlen or 1))
         return frame
@@ -121,7 +130,8 @@ class DroppedFrames(AbstractAround):
             self._last = self.inside.step(control)
         return self._last
 
-    def _begin(self, frame: CameraFrame, seed: int) -> CameraFrame:
+    def begin(self, frame: CameraFrame, seed: int) -> CameraFrame:
+        """Forget the drive before; see the family."""
         self._draws = np.random.default_rng([seed, _STREAM])
         self._last = frame
         return frame
@@ -153,7 +163,8 @@ class LateControls(AbstractAround):
         self._controls.append(control)
         return self._controls.popleft()
 
-    def _begin(self, frame: CameraFrame, seed: int) -> CameraFrame:
+    def begin(self, frame: CameraFrame, seed: int) -> CameraFrame:
+        """Forget the drive before; see the family."""
         del seed
         count = len(self.control_names)
         none = 0.0 if count == 1 else np.zeros(count)

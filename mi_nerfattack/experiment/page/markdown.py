@@ -317,7 +317,8 @@ def transfer_sections(drives: pd.DataFrame) -> Iterator[str]:
     compare_rows(rows)
     columns = column_figures(rows, drives, _SEED)
     header = ["condition", "no object", "attack", "out of the lane", "ratio", "kept"]
-    for environment in ENVIRONMENTS:
+    others = {column["environment"] for column in columns} - set(ENVIRONMENTS)
+    for environment in (*ENVIRONMENTS, *sorted(others)):
         own = [_column(c) for c in columns if c["environment"] == environment]
         if own:
             yield f"## {environment}\n\n{markdown_table(header, own)}"

@@ -151,6 +151,12 @@ def _provenance(folder: Path) -> tuple[dict[str, str], dict[str, str]]:
         f"{key.removeprefix('scenario.')}: {value['file']}": value["sha256"]
         for key, value in named.items()
     }
+    for key, value in sorted(about.items()):  # of other packages
+        if key.startswith("scenario.") and key.endswith(".package"):
+            made_with[key.removeprefix("scenario.")] = json.loads(value)
+    for key, value in named.items():
+        if "packages" in value:
+            made_with[key.removeprefix("scenario.")] = value["packages"]
     return made_with, digests
 
 

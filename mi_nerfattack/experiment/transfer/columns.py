@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.place import Conditions
-from mi_nerfattack.deploy.registry import kinematic_vehicle
+from mi_nerfattack.deploy.registry import kinematic_vehicle, offered_environment
 from mi_nerfattack.deploy.stress.pose_error import PoseError
 from mi_nerfattack.deploy.stress.timing import DroppedFrames, LateControls, LateFrames
 from mi_nerfattack.deploy.surrogate.environment import SurrogateEnvironment
@@ -22,6 +22,9 @@ from mi_nerfattack.scenario.deployment import SURROGATE, Deployment
 from mi_nerfattack.scenario.scenario import Scenario
 from mi_nerfattack.scenario.vehicle import CustomSection
 from mi_nerfattack.scenario.world import World
+
+if TYPE_CHECKING:
+    from mi_nerfattack.system.entry_points import Offer
 
 #: Where objects are pasted, and where they can also be built in.
 PASTED = (SURROGATE, "mitsuba", "mujoco", "mujoco_gl")
@@ -58,6 +61,7 @@ class Condition:
         placement_m: standard deviation of the objects' places, see `PoseError`.
         turn_deg: standard deviation of the objects' turns, see `PoseError`.
         pitch_deg: standard deviation of the camera's pitch, see `PoseError`.
+        others: conditions of other packages, word and number each.
     """
 
     sky: str = "day"
@@ -70,6 +74,7 @@ class Condition:
     placement_m: NonNegative = 0.0
     turn_deg: NonNegative = 0.0
     pitch_deg: NonNegative = 0.0
+    others: tuple[tuple[str, Finite], ...] = ()
 
     @property
     def errors(self) -> PoseError:
@@ -89,6 +94,7 @@ class Condition:
             if value := getattr(self, name):
                 sign = "+" * (word == "exposure" and value > 0)
                 parts.append(f"{word}:{sign}{value:g}")
+        parts += [f"{word}:{value:g}" for word, value in self.others]
         return ",".join(parts) or "day"
 
     def around(self, environment: AbstractEnvironment) -> AbstractEnvironment:
@@ -99,7 +105,36 @@ class Condition:
             environment = LateFrames(environment, self.late_periods)
         if self.latency_periods:
             environment = LateControls(environment, self.latency_periods)
+        for word, value in self.others:
+            offer = _offered(word)
+            environment = offer.value(environment, value)
+            if not isinstance(environment, AbstractEnvironment):
+                raise offer.refuse(f"makes {environment!r}, no AbstractEnvironment")
         return environment
+
+    def identity(self) -> dict[str, Any]:
+        """Return its values, and the packages of other conditions, as JSON."""
+        values = asdict(self)
+        if not values.pop("others"):
+            return values
+        packages = {word: _offered(word).package for word, _ in self.others}
+        return values | {"others": list(self.others), "packages": packages}
+
+
+def _further_words() -> list[str]:
+    from mi_nerfattack.system import entry_points
+
+    return entry_points.names(entry_points.CONDITIONS)
+
+
+def _offered(word: str) -> Offer:
+    """Return what puts a condition of another package around an environment."""
+    from mi_nerfattack.system import entry_points
+
+    offer = entry_points.find(entry_points.CONDITIONS, word, _WORDS, "--conditions: ")
+    if not callable(offer.value):
+        raise offer.refuse(f"is {offer.value!r}, no class and no function")
+    return offer
 
 
 def parse_condition(text: str) -> Condition:
@@ -116,19 +151,26 @@ def parse_condition(text: str) -> Condition:
     for part in text.split(","):
         word, colon, number = part.partition(":")
         name = _WORDS.get(word) if colon else "sky" if word in DAYLIGHT else None
+        further = _further_words() if name is None else []
+        if colon and word in further:
+            _offered(word)  # refuses what cannot be imported
+            name = f"other:{word}"
         if name is None or name in values:
+            words = ", ".join([*_WORDS, *further])
             raise InputError(
                 f"--conditions: {text!r}: {part!r}; a time of day "
-                f"({', '.join(DAYLIGHT)}) or WORD:NUMBER with {', '.join(_WORDS)}, "
-                "each once, parted by commas"
+                f"({', '.join(DAYLIGHT)}) or WORD:NUMBER with {words}, each once, "
+                "parted by commas"
             )
         try:
-            kind = int if kinds[name] == "Whole" else float
+            kind = int if kinds.get(name) == "Whole" else float
             values[name] = word if name == "sky" else kind(number)
         except ValueError as err:
             raise InputError(f"--conditions: {text!r}: {word}: {err}") from err
+    others = {k: values.pop(k) for k in list(values) if k.startswith("other:")}
+    pairs = tuple((k.removeprefix("other:"), v) for k, v in others.items())
     try:
-        return Condition(**values)
+        return Condition(**values, others=pairs)
     except InputError as err:
         raise InputError(f"--conditions: {text!r}: {err}") from err
 
@@ -138,7 +180,7 @@ class Column:
     """An environment under a condition.
 
     Args:
-        environment: one of `ENVIRONMENTS`.
+        environment: one of `ENVIRONMENTS`, or of another package, which pastes objects.
         condition: see there.
         spp: samples per pixel of path-traced images.
     """
@@ -171,13 +213,17 @@ class Column:
 
     def identity(self) -> dict[str, Any]:
         """Return all that decides about its drives, as JSON."""
-        found = {"environment": self.environment, **asdict(self.condition)}
-        traced = self.name in ("mitsuba", "mujoco")
+        found = {"environment": self.environment, **self.condition.identity()}
+        traced = (
+            self.name in ("mitsuba", "mujoco") or self.environment not in ENVIRONMENTS
+        )
         return found | ({"spp": self.spp} if traced else {})
 
     def check(self, scenario: Scenario) -> None:
         """Raise InputError unless a scenario's vehicle can drive there."""
-        if isinstance(scenario.vehicle, CustomSection) and "mujoco" in self.name:
+        vehicle = scenario.vehicle
+        is_custom = isinstance(vehicle, CustomSection) or vehicle.unit == "other"
+        if is_custom and "mujoco" in self.name:
             raise InputError(
                 f"--environments: {self.environment} drives a car with wheels, whose "
                 f"control is not that of the custom vehicle of {scenario.name!r}; "
@@ -225,7 +271,7 @@ def make_columns(
     """Return all environments under all conditions that have an effect there.
 
     Args:
-        environments: of `ENVIRONMENTS`, each once.
+        environments: of `ENVIRONMENTS` or of other packages, each once.
         conditions: see `parse_condition`, each once.
         spp: samples per pixel of path-traced images, at least 1.
 
@@ -235,8 +281,7 @@ def make_columns(
     """
     for name in environments:
         if name not in ENVIRONMENTS:
-            known = ", ".join(ENVIRONMENTS)
-            raise InputError(f"--environments: {name!r}; one of {known}")
+            offered_environment(name, "--environments: ", ENVIRONMENTS)
     parsed = [parse_condition(text) for text in conditions]
     for option, given in (("environments", environments), ("conditions", parsed)):
         if not given or len(set(given)) < len(given):

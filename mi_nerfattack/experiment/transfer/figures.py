@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +79,7 @@ def make_document(work: TransferDrives, figures: Figures) -> dict[str, Any]:
         "cases": list(work.cases),
         "success_s": DEPARTED_S,
         "conditions": {
-            column.condition.label: asdict(column.condition)
+            column.condition.label: column.condition.identity()
             for column in sorted(work.columns, key=lambda c: c.environment == SURROGATE)
         },
         "attacks": [_about(found) for found in work.attacks],

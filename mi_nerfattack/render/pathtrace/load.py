@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from html.parser import HTMLParser
@@ -97,6 +97,7 @@ def set_daylight(scene: Any, name: str) -> None:
 _CROP = ("crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
 _VALUE = re.compile(r"""=\s*["']([^"'$\n]+)["']""")
 _PARAMETER = re.compile(r"\$(\w+)")
+_UNKNOWN = re.compile(r'Plugin "([^"]+)" not found')
 
 
 def load_scene(
@@ -124,22 +125,25 @@ def load_scene(
         InputError: whatever the parser or a plugin refuses, in one line with the file;
             a root element that is no scene; a size for a film with a crop window.
     """
-    config = _config()
-    try:
-        with _resolved_from(path):
-            state = mi.parser.parse_file(config, str(path), **(parameters or {}))
-            _refuse_empty_bitmaps(path, state)
-            if size_px is not None:
-                _resize_films(path, state, size_px)
-            if layers:
-                _add_layers(state)
-            config.merge_meshes = not _has_rectangles(state)
-            for name, shape in (shapes or {}).items():
-                state.nodes[0].props[name] = shape
-            mi.parser.transform_all(config, state)
-            scene = mi.parser.instantiate(config, state)
-    except RuntimeError as error:
-        raise InputError(f"{path}: {_in_one_line(path, str(error))}") from error
+
+    def change(state: Any) -> None:
+        _refuse_empty_bitmaps(path, state)
+        if size_px is not None:
+            _resize_films(path, state, size_px)
+        if layers:
+            _add_layers(state)
+        for name, shape in (shapes or {}).items():
+            state.nodes[0].props[name] = shape
+
+    scene, missed = None, set[str]()
+    while scene is None:
+        try:
+            scene = _instantiate(path, parameters or {}, change)
+        except RuntimeError as error:
+            unknown = _UNKNOWN.search(str(error))
+            if not (unknown and _registers(unknown[1], missed)):
+                text = _in_one_line(path, str(error))
+                raise InputError(f"{path}: {text}") from error
     if not isinstance(scene, mi.Scene):
         raise InputError(
             f"{path}: describes a {type(scene).__name__}; its root must be <scene>"
@@ -148,6 +152,28 @@ def load_scene(
     if np.isfinite(corners).all():  # which a scene without shapes has not
         require_near(path, corners)
     return scene
+
+
+def _instantiate(
+    path: str | Path, parameters: Mapping[str, str], change: Callable[[Any], None]
+) -> Any:
+    """Parse a file, change what it describes, and make its root."""
+    config = _config()
+    with _resolved_from(path):
+        state = mi.parser.parse_file(config, str(path), **parameters)
+        change(state)
+        config.merge_meshes = not _has_rectangles(state)
+        mi.parser.transform_all(config, state)
+        return mi.parser.instantiate(config, state)
+
+
+def _registers(plugin: str, missed: set[str]) -> bool:
+    """Whether another package registers a plugin that Mitsuba misses, first time."""
+    from mi_nerfattack.system import entry_points
+
+    is_new = plugin not in missed
+    missed.add(plugin)
+    return is_new and entry_points.register_plugin(plugin)
 
 
 def scene_files(path: str | Path) -> list[Path]:
@@ -185,11 +211,8 @@ def named_files(
         InputError: the XML cannot be read.
     """
     with _resolved_from(path):
-        try:
-            given = dict(parameters or {})
-            state = mi.parser.parse_file(_config(), str(path), **given)
-        except RuntimeError as error:
-            raise InputError(f"{path}: {_in_one_line(path, str(error))}") from error
+        given = dict(parameters or {})
+        state = _parsed(path, given)
         texts = [Path(str(name)).resolve() for name in state.files]
         names = [
             node.props[key]
@@ -210,6 +233,38 @@ def named_files(
     included = {f"included {k}": text for k, text in enumerate(texts[1:])}
     there = {k: file.resolve() for k, file in found.items() if os.path.isfile(file)}
     return included | there
+
+
+def plugin_packages(path: str | Path) -> str:
+    """Return names and versions of the packages whose plugins a scene's file names.
+
+    Args:
+        path: XML file; included ones are followed.
+
+    Returns:
+        "" where all plugins are of Mitsuba or of this package.
+
+    Raises:
+        InputError: the XML cannot be read, or a package cannot be imported.
+    """
+    with _resolved_from(path):
+        nodes = _parsed(path, {}).nodes
+    # Mitsuba's manager knows the plugins in C++ alone.
+    known = mi.PluginManager.instance().plugin_type
+    names = {node.props.plugin_name() for node in nodes}
+    unknown = [x for x in names if known(x) == mi.ObjectType.Unknown]
+    if not unknown:
+        return ""
+    from mi_nerfattack.system import entry_points
+
+    return entry_points.plugin_packages(unknown)
+
+
+def _parsed(path: str | Path, parameters: Mapping[str, str]) -> Any:
+    try:
+        return mi.parser.parse_file(_config(), str(path), **parameters)
+    except RuntimeError as error:
+        raise InputError(f"{path}: {_in_one_line(path, str(error))}") from error
 
 
 class _Attributes(HTMLParser):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, model_validator
@@ -24,7 +24,6 @@ from mi_nerfattack.scenario.section import (
     Section,
     Trust,
     Unit,
-    check_count,
     refuse,
 )
 
@@ -50,6 +49,7 @@ class AbstractPolicySection(Section):
     trust_code: Trust = False  # of files that are code: they run with all rights
 
     later: ClassVar[tuple[str, ...]] = ("inputs", "route_m", "trajectory")
+    group: ClassVar[str] = "mi_nerfattack.policies"
     #: Times of the positions that the kind itself gives, seconds; () where none.
     own_times_s: ClassVar[tuple[float, ...]] = ()
     #: Control period that the kind was trained with, seconds; None where any will do.
@@ -57,8 +57,9 @@ class AbstractPolicySection(Section):
 
     @property
     def source(self) -> str:
-        """The file or URL, as it is given."""
-        return next(str(v) for (key, *_), v in self.leaves() if key in ("file", "url"))
+        """The file or URL, as it is given; the kind of a policy with neither."""
+        values = dict(self)
+        return str(values.get("file") or values.get("url") or values["kind"])
 
     def unit(self) -> str | None:
         """Return the unit of the first control; None where nothing says it."""
@@ -153,3 +154,34 @@ class AbstractPolicySection(Section):
         for key in unused:
             if getattr(section, key) != usual[key]:
                 refuse(f"trajectory.{key}", f"has no effect on {section.controls[0]}")
+
+
+def misfit(given: str | None, taken: str | None, source: str) -> str:
+    """Say why a vehicle does not take a policy's control; nothing if it may.
+
+    Args:
+        given: unit of the policy's control; None where nothing says it.
+        taken: unit of the vehicle's control; None where nothing says it.
+        source: of the policy, for the message.
+    """
+    if None in (given, taken) or given == taken:
+        return ""
+    return (
+        f"takes {taken}, and {source} gives {given}; take another of them, or convert "
+        "the control by policy.control_scale"
+    )
+
+
+def check_count(given: int, names: Sequence[str]) -> None:
+    """Refuse a policy that gives more or fewer controls than its vehicle takes.
+
+    Args:
+        given: number of the policy's.
+        names: of the vehicle's.
+    """
+    if given != len(names):
+        refuse(
+            "policy.output",
+            f"the policy gives {given}, the vehicle takes {len(names)}: "
+            f"{', '.join(names)}; give a column for each",
+        )

@@ -51,7 +51,7 @@ class AbstractNetworkSection(AbstractPolicySection):
     goal: Annotated[NoGoal | IntegerGoal | OneHotGoal, Kinds()] | None = None
     batch: Literal[1] | None = None  # where it takes one image at a time
 
-    def _policy(
+    def policy_of(
         self,
         module: torch.nn.Module,
         views: Views,
@@ -117,7 +117,7 @@ class PilotNetSection(AbstractNetworkSection):
 
     def build(self, views: Views = NO_VIEWS) -> AbstractPolicy:
         """Load the network."""
-        return self._policy(PilotNet.load(self.file.file), views)
+        return self.policy_of(PilotNet.load(self.file.file), views)
 
 
 class ModuleSection(AbstractNetworkSection):
@@ -135,7 +135,7 @@ class ModuleSection(AbstractNetworkSection):
             load_state(module, self.weights_file.file)
         else:
             self._refuse_drawn(module)
-        return self._policy(module, views, recurrent=self.recurrent)
+        return self.policy_of(module, views, recurrent=self.recurrent)
 
     def _refuse_drawn(self, module: torch.nn.Module) -> None:
         """Make the module once more, from other random numbers, and compare."""
@@ -193,7 +193,7 @@ class ProgramSection(AbstractNetworkSection):
             network = _load_onnx(path)
             network.choose(self._names, len(self.recurrent))
             batch = network.batch
-        return self._policy(network, views, batch, self.recurrent)
+        return self.policy_of(network, views, batch, self.recurrent)
 
 
 class DrJitSection(AbstractNetworkSection):
@@ -208,7 +208,7 @@ class DrJitSection(AbstractNetworkSection):
         network = self._made(Callable, "drjit.nn module or a function")
         if self.weights_file is not None:
             load_drjit_state(network, self.weights_file.file)
-        return self._policy(DrJitNetwork(network), views)
+        return self.policy_of(DrJitNetwork(network), views)
 
 
 class CallableSection(AbstractPolicySection):
@@ -277,7 +277,7 @@ PolicySection = Annotated[
     | DrJitSection
     | CallableSection
     | HttpSection,
-    Kinds(_kind_of),
+    Kinds(_kind_of, AbstractPolicySection),
 ]
 
 
