@@ -26,9 +26,18 @@ import tyro
 
 import mi_nerfattack
 from mi_nerfattack.backend.interrupts import raised_interrupts
-from mi_nerfattack.commands import THEMES, Command, Commands, Group, each, flat
+from mi_nerfattack.commands import (
+    PACKAGES,
+    THEMES,
+    Command,
+    Commands,
+    Group,
+    each,
+    flat,
+)
 from mi_nerfattack.commands.shared.terminal import stdout_to_stderr
 from mi_nerfattack.errors import InputError, NerfAttackError, is_interrupt
+from mi_nerfattack.extras import require
 
 PROG, PACKAGE = "mi-nerfattack", "mi_nerfattack"
 EXIT_INPUT = 2
@@ -129,6 +138,7 @@ def _run(arguments: list[str], themes: Mapping[str, Commands], prog: str) -> int
         code = stop.code or 0
         return code if isinstance(code, int) else EXIT_INPUT
     try:
+        _check_packages(command, commands)
         return _tell(command)
     except SystemExit as stop:
         if not isinstance(stop.__context__, BrokenPipeError):
@@ -224,6 +234,13 @@ def _tell(command: Command) -> int:
     with stdout_to_stderr() if as_json else contextlib.nullcontext():
         result = command.run()
     return result if isinstance(result, int) else result.tell(as_json)
+
+
+def _check_packages(command: Command, commands: Commands) -> None:
+    """Raise SetupError where an optional package that a command needs is missing."""
+    for words, kind in each(commands):
+        if kind is type(command):
+            require(" ".join(words), *PACKAGES.get(kind, ()))
 
 
 def _check_name(arguments: Sequence[str], commands: Commands, group: str = "") -> None:

@@ -20,8 +20,8 @@ from packaging.requirements import InvalidRequirement, Requirement
 from mi_nerfattack import variant
 from mi_nerfattack.backend import llvm
 from mi_nerfattack.errors import NerfAttackError
+from mi_nerfattack.extras import install_hint
 from mi_nerfattack.io import files
-from mi_nerfattack.system.extras import install_hint
 from mi_nerfattack.system.machine import cores
 from mi_nerfattack.system.processes import module_command
 

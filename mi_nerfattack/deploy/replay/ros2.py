@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from mi_nerfattack.errors import InputError, SetupError
+from mi_nerfattack.extras import load_extra
 from mi_nerfattack.io import files
-from mi_nerfattack.system.extras import load_extra
 
 MAX_LOG_BYTES = 1 << 32
 MAX_CHUNK_BYTES = 1 << 30
@@ -104,8 +104,8 @@ def decoder(name: str) -> Callable[[bytes], Any]:
     Raises:
         SetupError: the package mcap-ros2-support is not installed.
     """
-    library = load_extra("mcap_ros2.decoder", "mcap", "a log of ROS 2 messages")
-    records = load_extra("mcap.records", "mcap", "a log of ROS 2 messages")
+    library = load_extra("mcap_ros2.decoder", "a log of ROS 2 messages")
+    records = load_extra("mcap.records", "a log of ROS 2 messages")
     text = definition(name.replace("/msg/", "/"))
     schema = records.Schema(
         id=1, name=name, encoding="ros2msg", data=text.encode("ascii")
@@ -153,7 +153,7 @@ def read_topics(path: Path) -> tuple[dict[str, Topic], tuple[str, ...]]:
         InputError: it cannot be read, or has other messages alone.
     """
     try:
-        McapError = load_extra("mcap.exceptions", "mcap", "an MCAP log").McapError
+        McapError = load_extra("mcap.exceptions", "an MCAP log").McapError
         decoder("sensor_msgs/msg/Image")
     except SetupError as error:
         raise InputError(f"{path}: {error}") from error
