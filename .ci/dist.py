@@ -78,7 +78,7 @@ def use(programs: Path, version: str) -> None:
         told = call(ours, "--version", where=where).split()
         if told != ["mi-nerfattack", version]:
             raise SystemExit(f"--version: {' '.join(told)}; the wheel is of {version}")
-        call(ours, "doctor", where=where)  # ends with 0 where the main job can run
+        call(ours, "doctor", where=where)  # 0: the core is all there
         frame = json.loads(call(ours, *RENDER.split(), "--json", where=where))
         look = "from PIL import Image; print(*Image.open('frame.png').size, "
         look += "*Image.open('frame.png').convert('L').getextrema())"

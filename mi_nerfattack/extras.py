@@ -32,6 +32,7 @@ OPTIONAL: Mapping[str, Optional] = {
     "carla": Optional("carla", "carla"),
     "cv2": Optional("markers", "opencv-python-headless"),
     "gymnasium": Optional("gym", "gymnasium"),
+    "lz4": Optional("mcap", "lz4"),
     "matplotlib": Optional("report", "matplotlib"),
     "mcap": Optional("mcap", "mcap"),
     "mcap_ros2": Optional("mcap", "mcap-ros2-support"),
@@ -47,6 +48,7 @@ OPTIONAL: Mapping[str, Optional] = {
     "submitit": Optional("submitit", "submitit"),
     "trimesh": Optional("mesh", "trimesh"),
     "viser": Optional("view", "viser"),
+    "zstandard": Optional("mcap", "zstandard"),
 }
 
 
