@@ -75,7 +75,7 @@ def require(purpose: str, *modules: str) -> None:
     if absent:
         extras = sorted({OPTIONAL[name].extra for name in absent})
         raise SetupError(
-            f"{purpose} needs {', '.join(absent)}, not installed; "
+            f"{purpose} needs {', '.join(absent)}, which cannot be imported; "
             f"{install_hint(*extras)}"
         )
 

@@ -29,7 +29,13 @@ EXTRAS = {
 }
 CORE = {canonicalize_name(Requirement(line).name) for line in PROJECT["dependencies"]}
 #: Names that Python imports, and what installs them where that has another name.
-OTHER_NAMES = {"PIL": "pillow", "pydantic_core": "pydantic", "serial": "pyserial"}
+OTHER_NAMES = {
+    "PIL": "pillow",
+    "markupsafe": "jinja2",
+    "pydantic_core": "pydantic",
+    "serial": "pyserial",
+    "typing_extensions": "pydantic",
+}
 WORDS = {kind: words for words, kind in each(COMMANDS)}
 STARTS = (*WRITERS, *(job.words for job in JOBS.values()))
 MONITOR = "car monitor absent --tracker vicon:127.0.0.1 --body car"
@@ -136,7 +142,7 @@ def test_a_command_refuses_without_its_package(
     monkeypatch.setitem(sys.modules, module, None)
     assert main(arguments(kind)) == 2
     error = capsys.readouterr().err
-    assert f"{' '.join(WORDS[kind])} needs {module}, not installed; " in error
+    assert f"{' '.join(WORDS[kind])} needs {module}, which cannot be imported; " in error
     assert error.strip().endswith(install_hint(OPTIONAL[module].extra))
     assert list(tmp_path.iterdir()) == []
 
