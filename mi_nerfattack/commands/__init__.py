@@ -173,7 +173,6 @@ PACKAGES: Mapping[type[Command], tuple[str, ...]] = {
     ExportMesh: ("skimage", "trimesh"),
     ExportOpenscenario: (*_TABLES, "skimage"),
     ExportPrint: _TABLES,
-    ExportRoutes: ("carla",),
     ExportScreen: _TABLES,
     Train: _TABLES,
     Evaluate: _TABLES,

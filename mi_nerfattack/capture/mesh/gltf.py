@@ -19,7 +19,7 @@ import numpy as np
 
 from mi_nerfattack.capture.mesh.accessors import Accessors
 from mi_nerfattack.capture.mesh.nodes import INSTANCES, place_meshes
-from mi_nerfattack.errors import InputError
+from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.extras import load_extra
 from mi_nerfattack.io import files
 from mi_nerfattack.io.strict import parse_json
@@ -133,7 +133,7 @@ def prepare(
         colours = _prepare_tree(path, tree, bool(chunks), accessors)
         place_meshes(path, tree, accessors)
         data = json.dumps(tree).encode()
-    except (InputError, FileNotFoundError):
+    except (InputError, SetupError, FileNotFoundError):
         raise
     # a damaged tree makes raise whatever is missing or of another type
     except Exception as error:
