@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -57,13 +56,6 @@ def install_hint(*extras: str) -> str:
     return f"install it with: pip install 'mi-nerfattack[{','.join(extras)}]'"
 
 
-def is_installed(module: str) -> bool:
-    """Return whether a package can be found, without importing it."""
-    if module in sys.modules:
-        return sys.modules[module] is not None
-    return find_spec(module) is not None
-
-
 def require(purpose: str, *modules: str) -> None:
     """Raise SetupError unless optional packages are installed; import none of them.
 
@@ -71,7 +63,7 @@ def require(purpose: str, *modules: str) -> None:
         purpose: what needs them, for the message.
         modules: keys of `OPTIONAL`.
     """
-    absent = [name for name in modules if not is_installed(name)]
+    absent = [name for name in modules if find_spec(name) is None]
     if absent:
         extras = sorted({OPTIONAL[name].extra for name in absent})
         raise SetupError(

@@ -142,7 +142,9 @@ def test_a_command_refuses_without_its_package(
     monkeypatch.setitem(sys.modules, module, None)
     assert main(arguments(kind)) == 2
     error = capsys.readouterr().err
-    assert f"{' '.join(WORDS[kind])} needs {module}, which cannot be imported; " in error
+    assert (
+        f"{' '.join(WORDS[kind])} needs {module}, which cannot be imported; " in error
+    )
     assert error.strip().endswith(install_hint(OPTIONAL[module].extra))
     assert list(tmp_path.iterdir()) == []
 

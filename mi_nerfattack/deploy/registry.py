@@ -192,8 +192,8 @@ def make_environment(
         conditions: of light and camera; those of the files unless given.
 
     Raises:
-        InputError: unknown name, a package that is not installed, a file that is
-            missing or cannot be read.
+        InputError: unknown name, or a file that is missing or cannot be read.
+        SetupError: a package is not installed.
     """
     if name not in ENVIRONMENTS:
         known = ", ".join(ENVIRONMENTS)

@@ -2,4 +2,4 @@
 
 from mi_nerfattack.extras import require
 
-require("the car and the view of MuJoCo", "mujoco")
+require("the environment of MuJoCo", "mujoco")
