@@ -156,22 +156,22 @@ def flat(themes: Mapping[str, Commands]) -> dict[str, type[Command] | Group]:
 COMMANDS = flat(THEMES)
 
 _TABLES = ("matplotlib", "pandas")
-_FITS = ("matplotlib", "skimage")
+_FITS = (*_TABLES, "skimage")
 #: Optional packages without which a command refuses before it starts. What only some
 #: options of a command need is loaded, and missed, where it is used.
 PACKAGES: Mapping[type[Command], tuple[str, ...]] = {
     Demo: _TABLES,
-    CaptureScene: ("matplotlib",),
-    CapturePhotographs: ("matplotlib", "pycolmap"),
-    CaptureVideo: ("av", "matplotlib", "pycolmap"),
+    CaptureScene: _TABLES,
+    CapturePhotographs: (*_TABLES, "pycolmap"),
+    CaptureVideo: (*_TABLES, "av", "pycolmap"),
     Fit: _FITS,
     Bake: _FITS,
-    CompareField: (*_TABLES, "skimage"),
+    CompareField: _FITS,
     AssetMesh: (*_FITS, "trimesh"),
     AssetCube: _FITS,
     AssetFolder: _FITS,
     ExportMesh: ("skimage", "trimesh"),
-    ExportOpenscenario: (*_TABLES, "skimage"),
+    ExportOpenscenario: _FITS,
     ExportPrint: _TABLES,
     ExportScreen: _TABLES,
     Train: _TABLES,
@@ -185,7 +185,7 @@ PACKAGES: Mapping[type[Command], tuple[str, ...]] = {
     CertifyGradient: _TABLES,
     Reproduce: _TABLES,
     Report: _TABLES,
-    View: (*_TABLES, "skimage", "viser"),
+    View: (*_FITS, "viser"),
     OverlayCommand: (*_TABLES, "av", "cv2"),
     Monitor: _TABLES,
     CompareDrives: _TABLES,

@@ -4,5 +4,5 @@ import lazy_loader
 
 from mi_nerfattack.extras import require
 
-require("a report", "matplotlib")
+require("a report", "matplotlib", "pandas")
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
