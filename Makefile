@@ -27,7 +27,7 @@ help:
 	@echo "make dist         build wheel and sdist, and run the wheel in an empty environment"
 	@echo "make clean        remove the virtual environment and what was built"
 
-demo: $(VENV)/.installed
+demo: $(VENV)/.installed-demo
 	$(VENV)/bin/mi-nerfattack demo
 
 test: $(VENV)/.installed-test
@@ -82,6 +82,11 @@ $(VENV)/.installed: pyproject.toml | check-python
 	@echo "== installing PyTorch, then this package and what it needs (minutes)"
 	$(PIP) install --quiet "$(TORCH)"
 	$(PIP) install --quiet -e .
+	@touch $@
+
+$(VENV)/.installed-demo: $(VENV)/.installed
+	@echo "== installing what the demo needs"
+	$(PIP) install --quiet -e ".[demo]"
 	@touch $@
 	@echo "== installed; the next run skips this"
 

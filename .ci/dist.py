@@ -1,6 +1,7 @@
 """Build wheel and sdist, and use the wheel in an environment that has nothing else.
 
-Also ask there how much of the package is typed for whoever installs it.
+The environment has no extras while the wheel is used. Then ask how much of the package
+is typed for whoever installs it.
 
 Run by `make dist`, in minutes: most of them install PyTorch, which comes from pip's
 cache once `make test` has fetched it. The arguments are further requirements.
@@ -61,13 +62,19 @@ def contents(wheel: Path) -> dict[str, int]:
 
 
 def install(wheel: Path, *more: str) -> Path:
-    """Make an environment of the wheel and what it needs; return its programs."""
+    """Make an environment of the wheel without extras; return its programs."""
     shutil.rmtree(EMPTY, ignore_errors=True)
     call(sys.executable, "-m", "venv", EMPTY)
     programs = EMPTY / ("Scripts" if os.name == "nt" else "bin")
     pip = programs / "python", "-m", "pip", "--disable-pip-version-check", "-q"
     call(*pip, "install", "--no-compile", *more, wheel)
     return programs
+
+
+def add_extras(programs: Path, wheel: Path) -> None:
+    """Install the extras whose types the public names have."""
+    pip = programs / "python", "-m", "pip", "--disable-pip-version-check", "-q"
+    call(*pip, "install", "--no-compile", f"{wheel}[demo,gym,mujoco,video]")
 
 
 def use(programs: Path, version: str) -> None:
@@ -78,7 +85,7 @@ def use(programs: Path, version: str) -> None:
         told = call(ours, "--version", where=where).split()
         if told != ["mi-nerfattack", version]:
             raise SystemExit(f"--version: {' '.join(told)}; the wheel is of {version}")
-        call(ours, "doctor", where=where)  # ends with 0 where the main job can run
+        call(ours, "doctor", where=where)  # 0: the core is all there
         frame = json.loads(call(ours, *RENDER.split(), "--json", where=where))
         look = "from PIL import Image; print(*Image.open('frame.png').size, "
         look += "*Image.open('frame.png').convert('L').getextrema())"
@@ -108,4 +115,5 @@ if __name__ == "__main__":
     built = build()
     installed = install(built, *sys.argv[1:])
     use(installed, built.name.split("-")[1])
+    add_extras(installed, built)
     check_types(installed)

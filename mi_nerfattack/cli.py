@@ -20,6 +20,7 @@ import textwrap
 import traceback
 from collections.abc import Mapping, Sequence
 from functools import reduce
+from importlib.util import find_spec
 from typing import Annotated, Any, get_type_hints
 
 import docstring_parser
@@ -27,9 +28,18 @@ import tyro
 
 import mi_nerfattack
 from mi_nerfattack.backend.interrupts import raised_interrupts
-from mi_nerfattack.commands import THEMES, Command, Commands, Group, each, flat
+from mi_nerfattack.commands import (
+    PACKAGES,
+    THEMES,
+    Command,
+    Commands,
+    Group,
+    each,
+    flat,
+)
 from mi_nerfattack.commands.shared.terminal import stdout_to_stderr
 from mi_nerfattack.errors import InputError, NerfAttackError, is_interrupt
+from mi_nerfattack.extras import require
 
 PROG, PACKAGE = "mi-nerfattack", "mi_nerfattack"
 EXIT_INPUT = 2
@@ -130,6 +140,7 @@ def _run(arguments: list[str], themes: Mapping[str, Commands], prog: str) -> int
         code = stop.code or 0
         return code if isinstance(code, int) else EXIT_INPUT
     try:
+        _check_packages(command, commands)
         return _tell(command)
     except SystemExit as stop:
         if not isinstance(stop.__context__, BrokenPipeError):
@@ -225,6 +236,14 @@ def _tell(command: Command) -> int:
     with stdout_to_stderr() if as_json else contextlib.nullcontext():
         result = command.run()
     return result if isinstance(result, int) else result.tell(as_json)
+
+
+def _check_packages(command: Command, commands: Commands) -> None:
+    """Raise SetupError where an optional package that a command needs is missing."""
+    for words, kind in each(commands):
+        needed = PACKAGES.get(kind, ()) if kind is type(command) else ()
+        if not all(map(find_spec, needed)):
+            require(" ".join(words), *needed)
 
 
 def _check_name(arguments: Sequence[str], commands: Commands, group: str = "") -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import trimesh
 
 from .atlas import Facade, facade_uv, swatch_uv
 from .mesh import MeshBuilder, box_faces, prism, rotate_z
+from .solids import trimesh
 
 #: A foot at most this high, metres, stands on the ground: its lower side is hidden.
 _ON_GROUND = 0.12

@@ -6,7 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import trimesh
+
+from mi_nerfattack.extras import missing
+
+try:
+    import trimesh
+except ImportError as error:
+    raise missing("trimesh", "the builder of a bundled mesh", error) from error
 
 _Z_UP_TO_Y_UP = np.array(
     [[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]]

@@ -15,9 +15,9 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = "mi_nerfattack"
 # Each part imports only what stands to its left.
 ORDER = (
-    "errors ranges notebook backend io system vehicle policy scenes fields render "
-    "rollout capture plugins attack deploy drives fit scenario evaluation training "
-    "report experiment car props commands cli bench"
+    "errors extras ranges notebook backend io system vehicle policy scenes fields "
+    "render rollout capture plugins attack deploy drives fit scenario evaluation "
+    "training report experiment car props commands cli bench"
 ).split()
 # Parts that can be used without torch; `vehicle` wraps it for its users.
 WITHOUT_TORCH = "errors io scenes fields render rollout capture plugins deploy".split()

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 from scipy import ndimage
-from skimage.measure import block_reduce
 
 from mi_nerfattack.capture.inputs import find_bounds
 from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.extras import load_extra
 from mi_nerfattack.render.camera.projection import project
 
 _COARSE, _FINE = 32, 64  # cells along each edge: while the box shrinks, and at last
@@ -135,7 +135,8 @@ def _inside(
 def _reduced(mask: np.ndarray) -> tuple[np.ndarray, int]:
     """Reduce a mask to about `_PIXELS`; a pixel is set if one of its parts is."""
     factor = max(1, max(mask.shape) // _PIXELS)
-    return block_reduce(mask, factor, np.max), factor
+    measure = load_extra("skimage.measure", "the box of an object in images")
+    return measure.block_reduce(mask, factor, np.max), factor
 
 
 def _touches(

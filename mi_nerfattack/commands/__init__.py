@@ -155,6 +155,42 @@ def flat(themes: Mapping[str, Commands]) -> dict[str, type[Command] | Group]:
 
 COMMANDS = flat(THEMES)
 
+_TABLES = ("matplotlib", "pandas")
+_FITS = (*_TABLES, "skimage")
+#: Optional packages without which a command refuses before it starts. What only some
+#: options of a command need is loaded, and missed, where it is used.
+PACKAGES: Mapping[type[Command], tuple[str, ...]] = {
+    Demo: _TABLES,
+    CaptureScene: _TABLES,
+    CapturePhotographs: (*_TABLES, "pycolmap"),
+    CaptureVideo: (*_TABLES, "av", "pycolmap"),
+    Fit: _FITS,
+    Bake: _FITS,
+    CompareField: _FITS,
+    AssetMesh: (*_FITS, "trimesh"),
+    AssetCube: _FITS,
+    AssetFolder: _FITS,
+    ExportMesh: ("skimage", "trimesh"),
+    ExportOpenscenario: _FITS,
+    ExportPrint: _TABLES,
+    ExportScreen: _TABLES,
+    Train: _TABLES,
+    Evaluate: _TABLES,
+    Retrain: _TABLES,
+    Check: _TABLES,
+    Attack: _TABLES,
+    Sweep: _TABLES,
+    Transfer: _TABLES,
+    CertifyRobustness: _TABLES,
+    CertifyGradient: _TABLES,
+    Reproduce: _TABLES,
+    Report: _TABLES,
+    View: (*_FITS, "viser"),
+    OverlayCommand: (*_TABLES, "av", "cv2"),
+    Monitor: _TABLES,
+    CompareDrives: _TABLES,
+}
+
 
 def each(commands: Commands) -> Iterator[tuple[tuple[str, ...], type[Command]]]:
     """Yield each command, those of groups among them, with the words that call it."""
@@ -165,4 +201,13 @@ def each(commands: Commands) -> Iterator[tuple[tuple[str, ...], type[Command]]]:
             yield (name,), item
 
 
-__all__ = ["COMMANDS", "THEMES", "Command", "Commands", "Group", "each", "flat"]
+__all__ = [
+    "COMMANDS",
+    "PACKAGES",
+    "THEMES",
+    "Command",
+    "Commands",
+    "Group",
+    "each",
+    "flat",
+]

@@ -1,4 +1,4 @@
-"""``mi-nerfattack doctor``: tell whether this machine can run the main job."""
+"""``mi-nerfattack doctor``: tell whether the package can run on this machine."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mi_nerfattack.commands.shared.terminal import Result
 class Doctor:
     """Check the installation, and say how to get what is missing.
 
-    The exit code is 0 where the main job can run, else 1.
+    The exit code is 0 where the package can run, else 1: extras may be absent.
     """
 
     json: bool = False

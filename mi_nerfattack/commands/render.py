@@ -147,6 +147,7 @@ class RenderPath(_Render):
 
     def _check(self) -> None:
         from mi_nerfattack.errors import InputError
+        from mi_nerfattack.extras import require
         from mi_nerfattack.io import files
 
         suffix = self.output.suffix.lower()
@@ -164,6 +165,8 @@ class RenderPath(_Render):
                 f"{self.output}: unknown suffix {suffix!r}; give .mp4, or the name "
                 "of a folder"
             )
+        if suffix == ".mp4":
+            require(f"{self.output}: a video", "av")
         check = files.check_writable if suffix == ".mp4" else files.check_folder
         check(self.output)
 

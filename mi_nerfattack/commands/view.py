@@ -86,9 +86,9 @@ class View:
 
     def _read(self, bars: StageBars) -> Contents:
         from mi_nerfattack.experiment.view.scene import read_contents
-        from mi_nerfattack.system.extras import load_extra
+        from mi_nerfattack.extras import load_extra
 
-        load_extra("viser", "view", "the viewer")
+        load_extra("viser", "the viewer")
         bars.say(f"reading {self.run_folder}")
         look = bars.counter("looking around", "frame ")
         return read_contents(self.run_folder, self.drive, look)

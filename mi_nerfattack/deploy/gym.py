@@ -7,16 +7,21 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import gymnasium
 import numpy as np
 
 from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
 from mi_nerfattack.deploy.place import Conditions, Place, bundled_place
 from mi_nerfattack.deploy.registry import ENVIRONMENTS, make_environment
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.extras import missing
 from mi_nerfattack.rollout.drive import departure_limits
 from mi_nerfattack.vehicle.route.polyline import LARGEST_M
 from mi_nerfattack.vehicle.route.route import Route, load_routes
+
+try:
+    import gymnasium
+except ImportError as error:
+    raise missing("gymnasium", "an environment of Gymnasium", error) from error
 
 #: Depth that observations have where there is nothing, and the largest, metres.
 FAR_M = 1000.0

@@ -223,8 +223,9 @@ def make_environment(
         settings: further arguments of the function of another package.
 
     Raises:
-        InputError: unknown name, a package that is not installed, a file that is
-            missing or cannot be read, or a function that makes no environment.
+        InputError: unknown name, a file that is missing or cannot be read, or a
+            function that makes no environment.
+        SetupError: a package is not installed.
     """
     conditions = conditions or Conditions()
     make, settings = ENVIRONMENTS.get(name), settings or {}

@@ -27,6 +27,7 @@ from mi_nerfattack.experiment.checks.before_attack import (
 from mi_nerfattack.experiment.claim import LOOKS, claimed
 from mi_nerfattack.experiment.finished import Finished, Frames, Run
 from mi_nerfattack.experiment.run_folder import Account, Effort, RunFolder
+from mi_nerfattack.extras import require
 from mi_nerfattack.rollout.drive import (
     ATTACK,
     BEST_RANDOM,
@@ -380,6 +381,8 @@ def attack_claimed(
         the document that ``metrics.json`` holds.
     """
     described, text = load_scenario(scenario, object_field, settings)
+    if frames == "all":
+        require("videos of all cases", "av")
     variant.ensure()
     policy = described.build_policy()
     sections = [section for _, section in labelled(described.deployment)]

@@ -12,6 +12,7 @@ import numpy as np
 
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy, srgb_to_linear_numpy
 from mi_nerfattack.capture.posed_images import PosedImages
+from mi_nerfattack.extras import load_extra
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.render.camera.lens import generate_rays, pose_arrays
@@ -289,13 +290,12 @@ def compare(
         mask: (h, w), bool, the pixels that count; None for all. Both images are alike
             in the others, as far as windows of SSIM reach into them.
     """
-    from skimage.metrics import structural_similarity
-
+    metrics = load_extra("skimage.metrics", "the score of a picture")
     mask = np.ones(image.shape[:2], bool) if mask is None else mask
     reference = np.where(mask[..., None], reference, image)
     error = float(np.mean((image.astype(np.float64) - reference)[mask] ** 2))
     psnr = float("inf") if error == 0 else -10 * float(np.log10(error))
-    similar: Any = structural_similarity(
+    similar: Any = metrics.structural_similarity(
         image,
         reference,
         data_range=1.0,

@@ -19,7 +19,6 @@ import stat
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ import numpy as np
 from PIL import Image
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.extras import load_extra
 from mi_nerfattack.io.strict import parse_json, parse_toml
 
 MAX_TEXT_BYTES = 1 << 28
@@ -132,11 +132,8 @@ def image_formats(path: str | Path, raw: bytes) -> tuple[str, ...]:
     """Return the formats of Pillow for `decode_image`; it then knows HEIC, too."""
     if raw[4:8] != b"ftyp" or raw[8:12] not in _HEIC_BRANDS:
         return "PNG", "JPEG", "WEBP"
-    try:
-        import_module("pillow_heif").register_heif_opener()
-    except ImportError as err:
-        told = "a HEIC photograph needs pillow-heif (our extra 'formats'), or JPEG"
-        raise InputError(f"{path}: {told}") from err
+    what = f"{path}: a HEIC photograph"
+    load_extra("pillow_heif", what, "convert it to JPEG").register_heif_opener()
     return ("HEIF",)
 
 

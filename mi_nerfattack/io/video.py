@@ -11,14 +11,25 @@ from typing import Any
 import numpy as np
 
 from mi_nerfattack.errors import InputError, SetupError
+from mi_nerfattack.extras import load_extra
 from mi_nerfattack.io import files
 
 CODEC = "libx264"
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov", ".avi", ".webm")
 MAX_VIDEO_BYTES = 1 << 32
 _OPTIONS = {"crf": "17", "preset": "medium"}
+_PURPOSE = "a video"  # for messages
 _BT709 = 1  # primaries and matrix of ITU-T H.273, equal to those of sRGB
 _SRGB_CURVE = 13
+
+
+def _av() -> Any:
+    return load_extra("av", _PURPOSE)
+
+
+def ffmpeg_error() -> Any:
+    """Return PyAV's exception for whatever FFmpeg cannot do."""
+    return load_extra("av.error", _PURPOSE).FFmpegError
 
 
 def even_size(width: int, height: int) -> tuple[int, int]:
@@ -45,10 +56,9 @@ def write_video(
     Raises:
         InputError: no frames, frames of several sizes, or a file that cannot be
             written.
-        SetupError: PyAV was built without H.264.
+        SetupError: PyAV is not installed, or was built without H.264.
     """
-    import av
-
+    av = _av()
     if CODEC not in av.codecs_available:
         raise SetupError(f"PyAV {av.__version__} has no {CODEC}; install it from PyPI")
     buffer = io.BytesIO()
@@ -86,17 +96,16 @@ def _add_stream(container: Any, shape: tuple[int, ...], fps: float) -> Any:
 
 
 def _to_yuv(image: np.ndarray) -> Any:
-    from av.video.frame import VideoFrame
-    from av.video.reformatter import ColorRange, Colorspace
-
+    VideoFrame = load_extra("av.video.frame", _PURPOSE).VideoFrame
+    kinds = load_extra("av.video.reformatter", _PURPOSE)
     height, width = image.shape[:2]
     even = even_size(width, height)
     more = ((0, even[1] - height), (0, even[0] - width), (0, 0))
     frame = VideoFrame.from_ndarray(np.pad(image, more, "edge"), format="rgb24")
     return frame.reformat(
         format="yuv420p",
-        dst_colorspace=Colorspace.ITU709,
-        dst_color_range=ColorRange.MPEG,
+        dst_colorspace=kinds.Colorspace.ITU709,
+        dst_color_range=kinds.ColorRange.MPEG,
     )
 
 
@@ -108,9 +117,7 @@ def check_fps(fps: float) -> None:
 
 def open_video(raw: bytes) -> Any:
     """Open the bytes of a video as PyAV's container."""
-    import av
-
-    return av.open(io.BytesIO(raw), metadata_errors="replace")
+    return _av().open(io.BytesIO(raw), metadata_errors="replace")
 
 
 def video_stream(path: Path, container: Any) -> Any:
@@ -147,8 +154,7 @@ def decode_video(path: Path, raw: bytes) -> Iterator[tuple[Any, int]]:
     Raises:
         InputError: it is no video, or damaged.
     """
-    from av.error import FFmpegError
-
+    FFmpegError = ffmpeg_error()
     try:
         with open_video(raw) as container:
             stream = video_stream(path, container)
@@ -165,8 +171,7 @@ def rgb_of(path: Path, frame: Any) -> np.ndarray:
     Raises:
         InputError: its pixels are of a kind that FFmpeg does not convert.
     """
-    from av.error import FFmpegError
-
+    FFmpegError = ffmpeg_error()
     try:
         return frame.to_ndarray(format="rgb24")
     except FFmpegError as error:

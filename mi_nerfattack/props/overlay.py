@@ -10,10 +10,10 @@ import numpy as np
 
 from mi_nerfattack.backend.colour import linear_to_uint8, srgb_to_linear_numpy
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.extras import load_extra
 from mi_nerfattack.props.attacked import AttackedBox
 from mi_nerfattack.render.camera.distortion import jacobian
 from mi_nerfattack.render.camera.intrinsics import Camera, ray_lengths, ray_slopes
-from mi_nerfattack.system.extras import load_extra
 
 _GREEN = 0.12, 0.35  # excess of green over its value: none of it, all of it
 _DARK = 24.0  # sRGB levels below which the excess is noise
@@ -43,7 +43,7 @@ class Overlay:
     """
 
     def __init__(self, box: AttackedBox, camera: Camera, keyed: bool = True) -> None:
-        self._cv2 = load_extra("cv2", "markers", "overlay")
+        self._cv2 = load_extra("cv2", "overlay")
         self.box, self.camera, self.keyed = box, camera, keyed
         x, y = ray_slopes(camera)
         stretch = np.ones_like(x)

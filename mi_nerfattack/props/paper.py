@@ -9,18 +9,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
-from matplotlib.backends.backend_pdf import PdfPages
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from PIL import Image
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.extras import missing
 from mi_nerfattack.io import files
 from mi_nerfattack.props.attacked import AttackedBox
 from mi_nerfattack.props.net import MM, Net, Rectangle
 from mi_nerfattack.report.plots.charts import RC
+
+try:
+    import matplotlib
+    from matplotlib.backends.backend_pdf import PdfPages
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+except ImportError as error:
+    raise missing("matplotlib", "a net on paper", error) from error
 
 PAPERS = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
 _MARGIN = 10.0  # what printers leave white, millimetres

@@ -20,8 +20,8 @@ from packaging.requirements import InvalidRequirement, Requirement
 from mi_nerfattack import variant
 from mi_nerfattack.backend import llvm
 from mi_nerfattack.errors import NerfAttackError
+from mi_nerfattack.extras import install_hint
 from mi_nerfattack.io import files
-from mi_nerfattack.system.extras import install_hint
 from mi_nerfattack.system.machine import cores
 from mi_nerfattack.system.processes import module_command
 
@@ -39,8 +39,8 @@ class Finding:
     Attributes:
         name: what it is.
         value: what was found.
-        state: "ok"; "missing", which keeps the main job from running; or "absent",
-            which does not.
+        state: "ok"; "missing", without which nothing runs; or "absent", without which
+            a part of the work does not.
         remedy: what to do about it, empty where nothing is needed.
     """
 
@@ -68,7 +68,7 @@ def examine(developer: bool = False) -> list[Finding]:
 
 
 def can_run(findings: Sequence[Finding]) -> bool:
-    """Tell whether nothing that the main job needs is missing."""
+    """Return whether nothing is missing that everything needs."""
     return all(finding.state != "missing" for finding in findings)
 
 
@@ -102,7 +102,7 @@ def print_table(findings: Sequence[Finding]) -> None:
             line = f"{', '.join(names)}: {remedy}"
             console.print(line, markup=False, soft_wrap=True)
     verdict = "can" if can_run(findings) else "cannot"
-    console.print(f"The main job {verdict} run on this machine.", highlight=False)
+    console.print(f"mi-nerfattack {verdict} run on this machine.", highlight=False)
 
 
 def _packages(developer: bool) -> Iterator[Finding]:

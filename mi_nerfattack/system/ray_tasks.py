@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mi_nerfattack.errors import InputError, SetupError
-from mi_nerfattack.system.extras import load_extra
+from mi_nerfattack.extras import load_extra
 from mi_nerfattack.system.workers import (
     AbstractWork,
     AbstractWorkers,
@@ -76,7 +76,7 @@ class RayTasks(AbstractWorkers):
 
     def _connect(self) -> Any:
         os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # it tells its makers otherwise
-        ray = load_extra("ray", "ray", "Ray")
+        ray = load_extra("ray", "Ray")
         more = {}
         if self.address == LOCAL:
             count = self.count and self.count * self.cores

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_nerfattack.errors import InputError, SetupError
-from mi_nerfattack.system.extras import load_extra
+from mi_nerfattack.extras import load_extra
 from mi_nerfattack.system.workers import (
     MOST,
     AbstractWork,
@@ -71,8 +71,7 @@ class SlurmJobs(AbstractWorkers):
     def _executor(self) -> tuple[Any, Any]:
         """Return what submits, and the module of its errors."""
         submitit, errors = (
-            load_extra(f"submitit{name}", "submitit", "SLURM")
-            for name in ("", ".core.utils")
+            load_extra(f"submitit{name}", "SLURM") for name in ("", ".core.utils")
         )
         cluster = "local" if self.partition is None else "slurm"
         try:
@@ -113,5 +112,5 @@ class _Piece:
 
     def checkpoint(self) -> Any:
         """Return what is submitted again; the piece itself knows what is left."""
-        helpers = load_extra("submitit.helpers", "submitit", "SLURM")
+        helpers = load_extra("submitit.helpers", "SLURM")
         return helpers.DelayedSubmission(self)

@@ -12,9 +12,8 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
-from ..solids import Colour, Part, box, cylinder, loft, merged, write_glb
+from ..solids import Colour, Part, box, cylinder, loft, merged, trimesh, write_glb
 
 HEIGHT = 1.45
 _PAINT, _TRIM, _RUBBER = (12, 54, 140, 255), (9, 10, 11, 255), (4, 4, 5, 255)

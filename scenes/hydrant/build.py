@@ -11,9 +11,8 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
-from ..solids import Part, cylinder, merged, write_glb
+from ..solids import Part, cylinder, merged, trimesh, write_glb
 
 HEIGHT = 0.75
 _RED, _WHITE = (190, 30, 28, 255), (232, 230, 222, 255)

@@ -28,7 +28,7 @@ from mi_nerfattack.deploy.surrogate.environment import SurrogateEnvironment
 from mi_nerfattack.deploy.surrogate.scene import field_sensor
 from mi_nerfattack.deploy.vehicle import KinematicVehicle, Motion
 from mi_nerfattack.deploy.views.mitsuba import MitsubaView
-from mi_nerfattack.errors import InputError
+from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov, look_at
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.camera.rig import Rig
@@ -213,7 +213,7 @@ def test_packages_that_cannot_be_imported(name, tmp_path, monkeypatch):
         if loaded.startswith("mi_nerfattack.deploy.mujoco"):
             monkeypatch.delitem(sys.modules, loaded)
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(InputError, match=rf"{package}.* pip install .*{package}"):
+    with pytest.raises(SetupError, match=rf"{package}.* pip install .*{package}"):
         make_environment(name, place)
     if package == "mujoco":
         monkeypatch.delitem(sys.modules, "mujoco")

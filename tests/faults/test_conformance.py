@@ -26,7 +26,8 @@ from support.faults.injected import (
 )
 
 from mi_nerfattack import cli
-from mi_nerfattack.commands import COMMANDS, each
+from mi_nerfattack.commands import COMMANDS, PACKAGES, each
+from mi_nerfattack.extras import OPTIONAL
 from mi_nerfattack.io import locks
 from tests.faults.jobs import EVENTS, JOBS, WRITERS
 from tests.faults.running import Runner, partial_files, times
@@ -186,6 +187,30 @@ def test_every_command_that_writes_is_tried():
 
 def begins(words: list[str], names: tuple[str, ...]) -> bool:
     return tuple(words[: len(names)]) == names
+
+
+BLOCKED = """
+import sys
+sys.path[:], blocked, words = {}, {}, {}
+sys.modules.update(dict.fromkeys(blocked))
+from mi_nerfattack.cli import main
+sys.exit(main(words))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in JOBS if name != "train"])
+def test_a_job_needs_only_the_packages_of_its_command(name, start):
+    """But for `train`, whose job is small in this process alone."""
+    runner = start(name)
+    folder, words = runner.begin(), f"{runner.job.words} {runner.job.options}".split()
+    kind = next(kind for names, kind in each(COMMANDS) if begins(words, names))
+    needed = {*PACKAGES.get(kind, ()), *(["av"] if "a.mp4" in words else [])}
+    code = BLOCKED.format(sys.path, sorted(OPTIONAL.keys() - needed), words)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_killed_process_leaves_what_the_suite_takes_it_to_leave(start):

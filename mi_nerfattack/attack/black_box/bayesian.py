@@ -9,7 +9,7 @@ import numpy as np
 from mi_nerfattack.attack.black_box.low_frequency import LowFrequency
 from mi_nerfattack.attack.black_box.search import AbstractSearch, Proposal
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.system.extras import load_extra
+from mi_nerfattack.extras import load_extra
 
 if TYPE_CHECKING:
     from optuna.trial import Trial
@@ -36,7 +36,7 @@ class BayesianSearch(AbstractSearch):
     def __init__(self, basis: LowFrequency, seed: int = 0) -> None:
         if basis.count > MOST:
             raise InputError(f"coefficients: {basis.count}; at most {MOST}")
-        optuna = load_extra("optuna", "bayesian", "Bayesian optimisation")
+        optuna = load_extra("optuna", "Bayesian optimisation")
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         self.basis = basis
         sampler = optuna.samplers.GPSampler(seed=seed, n_startup_trials=_RANDOM_FIRST)

@@ -54,11 +54,7 @@ def run_task(task: dict[str, Any], stages: Stages) -> int:
             process.kill()
             raise
     if stages.missing is not None:
-        raise SetupError(
-            f"pycolmap: {stages.missing}; COLMAP models are read and poses estimated "
-            "with it: pip install pycolmap; where it cannot be installed, give 'fit' "
-            "a transforms.json (nerfstudio writes one of a COLMAP model)"
-        )
+        raise SetupError(stages.missing)
     return code
 
 

@@ -19,6 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from mi_nerfattack.errors import SetupError
+from mi_nerfattack.extras import load_extra
+
 MARK = "@ "
 RESULT = "structure.json"
 POINTS = "points.npy"
@@ -29,6 +32,8 @@ _MANY = 20  # photographs of a camera that may tell its principal point
 _TOLD_SD = 0.005  # of the longer edge, at most: how surely they tell it
 _LEAST_TRACK = 3  # images that see a point which counts
 _OVERLAP = 10  # sequential: neighbours, and neighbours at distances 2^k, k < overlap
+_PURPOSE = "COLMAP: to read models and estimate poses"  # for messages
+_OTHERWISE = "give 'fit' a transforms.json, such as nerfstudio writes of a COLMAP model"
 _BLOCK = 10  # exhaustive: photographs a side of the squares of pairs that are logged
 _PADDING = bytes(1 << 20)
 
@@ -43,8 +48,8 @@ def main() -> int:
 def run(task: dict[str, Any]) -> int:
     """Run a task, in this process; return its exit code."""
     try:
-        import pycolmap
-    except ImportError as error:
+        pycolmap = load_extra("pycolmap", _PURPOSE, _OTHERWISE)
+    except SetupError as error:
         _say(missing=str(error))
         return 2
     pycolmap.logging.logtostderr = True  # no file among the temporary ones

@@ -17,7 +17,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +24,10 @@ import numpy as np
 
 from mi_nerfattack.capture.mesh.accessors import Accessors
 from mi_nerfattack.capture.mesh.nodes import INSTANCES, place_meshes
-from mi_nerfattack.errors import InputError
+from mi_nerfattack.errors import InputError, SetupError
+from mi_nerfattack.extras import load_extra
 from mi_nerfattack.io import files
 from mi_nerfattack.io.strict import parse_json
-from mi_nerfattack.system.extras import install_hint
 
 MAX_BYTES = 1 << 30
 #: Name under which the prepared JSON asks for the binary chunk of a .glb file.
@@ -140,7 +139,7 @@ def prepare(
         colours = _prepare_tree(path, tree, bool(chunks), accessors)
         place_meshes(path, tree, accessors)
         data = json.dumps(tree).encode()
-    except (InputError, FileNotFoundError):
+    except (InputError, SetupError, FileNotFoundError):
         raise
     # a damaged tree makes raise whatever is missing or of another type
     except Exception as error:
@@ -293,11 +292,8 @@ def _is_draco(where: str, tree: Any, primitive: Any) -> bool:
         if not all(stored):
             raise InputError(f"{where}: has no data; export the mesh again")
         return False
-    if find_spec("DracoPy") is None:
-        raise InputError(
-            f"{where}: is compressed by {_DRACO}, which needs DracoPy: "
-            f"{install_hint('formats')}; or export the mesh uncompressed"
-        )
+    what = f"{where}: compression by {_DRACO}"
+    load_extra("DracoPy", what, "export the mesh uncompressed")
     return True
 
 

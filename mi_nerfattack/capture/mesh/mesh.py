@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy, srgb_to_linear_numpy
 from mi_nerfattack.capture.mesh.mitsuba_mesh import MeshArrays, make_mesh
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.extras import load_extra
 
 #: A cube's faces as seen from outside: outward normal, right and up of the picture.
 #: Around -y, the front of a glTF model, they unfold into a cross.
@@ -104,10 +105,9 @@ class TexturedMesh:
     @property
     def area(self) -> float:
         """Sum of the areas of all triangles."""
-        from trimesh.triangles import area
-
+        of = load_extra("trimesh.triangles", "the area of a mesh")
         triangles = [part.vertices[part.faces] for part in self.parts]
-        return float(area(np.concatenate(triangles)).sum())
+        return float(of.area(np.concatenate(triangles)).sum())
 
     def placed(self, matrix: np.ndarray, offset: np.ndarray) -> TexturedMesh:
         """Apply an affine map to all parts; see `MeshPart.placed`."""

@@ -20,6 +20,7 @@ from mi_nerfattack.capture.mesh.gltf import MAX_BYTES, BaseColour, prepare
 from mi_nerfattack.capture.mesh.mesh import MeshPart, TexturedMesh
 from mi_nerfattack.capture.mesh.texture import flat_texture, laid_out
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.extras import load_extra
 from mi_nerfattack.io import files
 from mi_nerfattack.io.strict import require_near
 
@@ -58,8 +59,7 @@ def load_mesh(path: str | Path, up: str | None = None) -> TexturedMesh:
             mesh uses a feature that is not supported, or a texture, buffer or
             material file is missing.
     """
-    import trimesh
-
+    trimesh = load_extra("trimesh", f"{path}: a mesh")
     path = Path(path)
     suffix = path.suffix.lower()
     with files.reported(path):
@@ -131,9 +131,9 @@ def _recording_resolver(path: Path, chunks: Mapping[str, bytes]) -> Any:
     It finds `chunks` by name, and files in the folder of `path` and below. Images of
     OBJ and PLY that cannot be read are remembered too.
     """
-    from trimesh.resolvers import FilePathResolver, Resolver
-
-    folder = FilePathResolver(str(path))
+    resolvers = load_extra("trimesh.resolvers", f"{path}: a mesh")
+    Resolver: Any = resolvers.Resolver
+    folder = resolvers.FilePathResolver(str(path))
 
     class RecordingResolver(Resolver):
         def __init__(self) -> None:

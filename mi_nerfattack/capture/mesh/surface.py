@@ -13,6 +13,7 @@ from scipy import ndimage
 from mi_nerfattack.capture.mesh.cube_faces import OBJECT_BOX, object_box, sheet_mesh
 from mi_nerfattack.capture.mesh.mesh import TexturedMesh
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.extras import load_extra
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.render.march import march
 from mi_nerfattack.render.posed import PosedField
@@ -63,11 +64,10 @@ def field_surface(field: GridField) -> ColouredMesh:
     """
     if (sheet := sheet_mesh(field)) is not None:
         return painted_mesh(field, sheet)
-    from skimage.measure import marching_cubes
-
+    measure = load_extra("skimage.measure", "the surface of a field")
     voxel = voxel_m(field)
     solid = _solid(_voxel_opacity(field, voxel))
-    found, faces, _, _ = marching_cubes(solid, _OPAQUE)
+    found, faces, _, _ = measure.marching_cubes(solid, _OPAQUE)
     smooth = ndimage.gaussian_filter(solid, _NORMALS_OVER)
     slope = np.stack(
         [
@@ -152,15 +152,14 @@ def inside_out(field: GridField, points: np.ndarray, normals: np.ndarray) -> np.
 
 def _divided(mesh: TexturedMesh, edge_m: float) -> np.ndarray:
     """Divide triangles until no edge is longer: corners (n, 3, 3), none degenerate."""
-    from trimesh.remesh import subdivide_to_size
-
+    remesh = load_extra("trimesh.remesh", "the surface of a mesh")
     found = []
     for part in mesh.parts:
         corners = part.vertices[part.faces]
         edges = corners - np.roll(corners, 1, axis=1)
         longest = float(np.linalg.norm(edges, axis=2).max())
         rounds = int(np.ceil(np.log2(max(1.0, longest / edge_m)))) + 1
-        divided = subdivide_to_size(
+        divided = remesh.subdivide_to_size(
             part.vertices, part.faces[has_area(corners)], edge_m, max_iter=rounds
         )
         found.append(divided[0][divided[1]])

@@ -12,11 +12,11 @@ from scipy.optimize import least_squares
 from mi_nerfattack.capture.colmap.follow import StageCallback
 from mi_nerfattack.capture.colmap.reconstruct import Structure
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.extras import load_extra
 from mi_nerfattack.io import files
 from mi_nerfattack.ranges import Positive, checked
 from mi_nerfattack.render.camera.distortion import direction, undistort
 from mi_nerfattack.render.camera.intrinsics import Camera
-from mi_nerfattack.system.extras import load_extra
 
 FAMILIES = (
     "4x4_50",
@@ -178,7 +178,7 @@ def detect_markers(grey: np.ndarray, family: str) -> dict[int, np.ndarray]:
 
     Ids that an image shows twice are left out.
     """
-    cv2 = load_extra("cv2", "markers", "a capture with markers")
+    cv2 = load_extra("cv2", "a capture with markers")
     dictionary = getattr(cv2.aruco, f"DICT_{family.upper()}")
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX

@@ -14,6 +14,8 @@ from typing import Any
 from mi_nerfattack.car.camera.preparation import AbstractPreparation, check_size
 from mi_nerfattack.car.devices import AbstractCamera, Clock, DeviceLostError, Frame
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.extras import load_extra
+from mi_nerfattack.io.video import ffmpeg_error
 
 DRIVER = "v4l2"
 _FIRST_S, _SILENT_S = 5.0, 1.0  # longest waits for the first frame, and for another
@@ -89,8 +91,7 @@ class V4lCamera(AbstractCamera):
         self._thread.join(_SILENT_S)
 
     def _read(self) -> None:
-        from av.error import FFmpegError
-
+        FFmpegError = ffmpeg_error()
         try:
             is_kernels = None
             for index, frame in enumerate(self._decoded()):
@@ -117,8 +118,7 @@ class V4lCamera(AbstractCamera):
 
     def _decoded(self) -> Any:
         """Yield the device's frames but for those that came damaged."""
-        from av.error import InvalidDataError
-
+        InvalidDataError = load_extra("av.error", "a camera").InvalidDataError
         for packet in self._container.demux(video=0):
             try:
                 yield from packet.decode()
@@ -127,9 +127,8 @@ class V4lCamera(AbstractCamera):
 
 
 def _opened(device: str, prepare: AbstractPreparation, fps: int, driver: str) -> Any:
-    import av
-    from av.error import FFmpegError
-
+    av = load_extra("av", "a camera")
+    FFmpegError = ffmpeg_error()
     width, height = prepare.source_px
     asked = {"video_size": f"{width}x{height}", "framerate": str(fps)}
     options = asked if driver == DRIVER else {}

@@ -19,9 +19,9 @@ import numpy as np
 
 from mi_nerfattack.car.camera.preparation import AbstractPreparation
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.extras import load_extra
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import Camera, ray_slopes
-from mi_nerfattack.system.extras import load_extra
 
 #: Width and height of an eye, pixels, and the end of a section's name, by mode.
 MODES = {
@@ -185,7 +185,7 @@ class LeftEye(AbstractPreparation):
     """
 
     def __init__(self, eye: EyeCalibration, camera: Camera) -> None:
-        self._cv2 = load_extra("cv2", "markers", "a ZED")
+        self._cv2 = load_extra("cv2", "a ZED")
         whole = eye.pinhole
         self.source_px = 2 * whole.width, whole.height
         self.camera = camera

@@ -30,9 +30,9 @@ from mi_nerfattack.car.devices import (
 from mi_nerfattack.car.drive.safety.judge import Cause, Stop
 from mi_nerfattack.deploy.replay.ros2 import definition, full_name
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.extras import load_extra
 from mi_nerfattack.io.growing import GrowingFile
 from mi_nerfattack.render.camera.intrinsics import Camera, planar_state
-from mi_nerfattack.system.extras import load_extra
 from mi_nerfattack.vehicle.route.route import Route
 
 
@@ -144,8 +144,8 @@ class DriveLog:
         wall_ns: int,
         about: Mapping[str, str],
     ) -> None:
-        library = load_extra("mcap_ros2.writer", "mcap", "the log of a drive")
-        kinds = load_extra("mcap.writer", "mcap", "the log of a drive").CompressionType
+        library = load_extra("mcap_ros2.writer", "the log of a drive")
+        kinds = load_extra("mcap.writer", "the log of a drive").CompressionType
         self._clock, self._start_s, self._wall_ns = clock, clock(), wall_ns
         self._is_open, self.counts = True, dict.fromkeys(TOPICS, 0)
         self._file = GrowingFile(path)

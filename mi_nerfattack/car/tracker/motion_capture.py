@@ -29,7 +29,7 @@ from mi_nerfattack.car.devices import (
 )
 from mi_nerfattack.car.tracker.newest import NewestPoses
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.system.extras import load_extra
+from mi_nerfattack.extras import load_extra
 from mi_nerfattack.system.processes import blocked_interrupts, safe_path
 
 KINDS = ("vicon", "qualisys", "optitrack", "vrpn", "nokov", "fzmotion", "mock")
@@ -166,7 +166,7 @@ class MotionCaptureTracker(AbstractTracker):
 
 
 def _package() -> Any:
-    return load_extra("motioncapture", "motion-capture", "a motion capture system")
+    return load_extra("motioncapture", "a motion capture system")
 
 
 def _matrix(values: tuple[float, ...]) -> np.ndarray | None:

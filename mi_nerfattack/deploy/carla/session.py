@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 import re
 import weakref
@@ -16,8 +15,8 @@ from pydantic import Field
 from mi_nerfattack.backend.interrupts import held_interrupts
 from mi_nerfattack.deploy.carla.conventions import CarlaPose
 from mi_nerfattack.errors import InputError, NerfAttackError
+from mi_nerfattack.extras import load_extra
 from mi_nerfattack.ranges import Name, Seconds, checked
-from mi_nerfattack.system.extras import install_hint
 
 _SUBSTEP = 0.01  # seconds of the physics
 _MAX_SUBSTEPS = 16  # CARLA's own limit
@@ -64,16 +63,13 @@ def load_client() -> Any:
     """Import CARLA's client.
 
     Raises:
-        InputError: it is not installed.
+        SetupError: it is not installed.
     """
-    try:
-        return importlib.import_module("carla")
-    except ImportError as error:
-        raise InputError(
-            f"environment 'carla': its client cannot be imported ({error}); "
-            f"{install_hint('carla')} (0.9.16 has wheels for Python 3.10 to 3.12 on "
-            "Linux and Windows, x86-64)"
-        ) from error
+    elsewhere = (
+        "drive in another environment: CARLA 0.9.16 has wheels for Python 3.10 to 3.12 "
+        "on Linux and Windows, x86-64"
+    )
+    return load_extra("carla", "environment 'carla'", elsewhere)
 
 
 class CarlaSession:

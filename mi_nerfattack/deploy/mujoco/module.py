@@ -5,13 +5,12 @@ from __future__ import annotations
 import os
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.extras import missing
 
 try:
     import mujoco
 except ModuleNotFoundError as error:
-    raise InputError(
-        f"MuJoCo: the package {error.name} is not installed; pip install mujoco"
-    ) from error
+    raise missing("mujoco", "the environment 'mujoco'", error) from error
 except (ImportError, AttributeError, OSError, RuntimeError) as error:
     # it fails in several ways where MUJOCO_GL names what is not there
     raise InputError(

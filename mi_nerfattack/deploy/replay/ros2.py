@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from mi_nerfattack.errors import InputError, SetupError
+from mi_nerfattack.extras import load_extra
 from mi_nerfattack.io import files
-from mi_nerfattack.system.extras import load_extra
 
 MAX_LOG_BYTES = 1 << 32
 MAX_CHUNK_BYTES = 1 << 30
@@ -104,8 +104,8 @@ def decoder(name: str) -> Callable[[bytes], Any]:
     Raises:
         SetupError: the package mcap-ros2-support is not installed.
     """
-    library = load_extra("mcap_ros2.decoder", "mcap", "a log of ROS 2 messages")
-    records = load_extra("mcap.records", "mcap", "a log of ROS 2 messages")
+    library = load_extra("mcap_ros2.decoder", "a log of ROS 2 messages")
+    records = load_extra("mcap.records", "a log of ROS 2 messages")
     text = definition(name.replace("/msg/", "/"))
     schema = records.Schema(
         id=1, name=name, encoding="ros2msg", data=text.encode("ascii")
@@ -153,7 +153,7 @@ def read_topics(path: Path) -> tuple[dict[str, Topic], tuple[str, ...]]:
         InputError: it cannot be read, or has other messages alone.
     """
     try:
-        McapError = load_extra("mcap.exceptions", "mcap", "an MCAP log").McapError
+        McapError = load_extra("mcap.exceptions", "an MCAP log").McapError
         decoder("sensor_msgs/msg/Image")
     except SetupError as error:
         raise InputError(f"{path}: {error}") from error
@@ -202,21 +202,23 @@ def _ended(raw: bytes) -> tuple[bytes, tuple[str, ...]]:
 
 def _messages(path: Path, raw: bytes) -> Iterator[tuple[str, str, str, bytes]]:
     """Yield topic, schema, encoding and data of all messages."""
-    from mcap.records import Channel, Chunk, Message, Schema
-    from mcap.stream_reader import StreamReader, breakup_chunk
-
+    kinds = load_extra("mcap.records", "an MCAP log")
+    library = load_extra("mcap.stream_reader", "an MCAP log")
     channels: dict[int, Any] = {}
     schemas: dict[int, str] = {0: ""}
-    reader = StreamReader(io.BytesIO(raw), emit_chunks=True, record_size_limit=len(raw))
+    reader = library.StreamReader(
+        io.BytesIO(raw), emit_chunks=True, record_size_limit=len(raw)
+    )
     for outer in reader.records:
-        is_chunk = isinstance(outer, Chunk)
-        chunk = breakup_chunk(_inflated(path, outer), True) if is_chunk else [outer]
+        is_chunk = isinstance(outer, kinds.Chunk)
+        inner = _inflated(path, outer) if is_chunk else outer
+        chunk = library.breakup_chunk(inner, True) if is_chunk else [outer]
         for record in chunk:
-            if isinstance(record, Schema):
+            if isinstance(record, kinds.Schema):
                 schemas[record.id] = record.name
-            elif isinstance(record, Channel):
+            elif isinstance(record, kinds.Channel):
                 channels[record.id] = record
-            elif isinstance(record, Message):
+            elif isinstance(record, kinds.Message):
                 channel = channels[record.channel_id]
                 schema = schemas[channel.schema_id]
                 yield channel.topic, schema, channel.message_encoding, record.data
@@ -245,8 +247,7 @@ def _inflated(path: Path, chunk: Any) -> Any:
 
 
 def _unzstd(data: bytes, size: int) -> bytes:
-    import zstandard
-
+    zstandard = load_extra("zstandard", "a log compressed by zstd")
     try:
         with zstandard.ZstdDecompressor().stream_reader(data) as reader:
             return reader.read(size + 1)
@@ -255,9 +256,8 @@ def _unzstd(data: bytes, size: int) -> bytes:
 
 
 def _unlz4(data: bytes, size: int) -> bytes:
-    import lz4.frame
-
+    frame = load_extra("lz4.frame", "a log compressed by lz4")
     try:
-        return lz4.frame.LZ4FrameDecompressor().decompress(data, size + 1)
+        return frame.LZ4FrameDecompressor().decompress(data, size + 1)
     except (RuntimeError, EOFError) as error:
         raise ValueError(str(error)) from error

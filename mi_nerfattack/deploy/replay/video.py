@@ -24,6 +24,7 @@ from mi_nerfattack.io.video import (
     MAX_VIDEO_BYTES,
     damaged_video,
     decode_video,
+    ffmpeg_error,
     open_video,
     rgb_of,
     video_stream,
@@ -89,8 +90,7 @@ class VideoRecording(AbstractRecording):
 
     def _scan(self) -> tuple[int, int, np.ndarray]:
         """Return width and height in pixels, and the times of all frames, seconds."""
-        from av.error import FFmpegError
-
+        FFmpegError = ffmpeg_error()
         try:
             with open_video(self._raw) as container:
                 stream = video_stream(self._path, container)

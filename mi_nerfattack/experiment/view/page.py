@@ -15,8 +15,8 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.view.frames import NOWHERE, FrameSource
 from mi_nerfattack.experiment.view.scene import Contents, RunScene, first_look
 from mi_nerfattack.experiment.view.viewer import describe
+from mi_nerfattack.extras import load_extra
 from mi_nerfattack.io import files
-from mi_nerfattack.system.extras import load_extra
 
 if TYPE_CHECKING:
     import viser
@@ -37,7 +37,7 @@ def serving(host: str, port: int) -> Iterator[viser.ViserServer]:
         InputError: nothing can listen there, as where something else does.
         SetupError: viser cannot be imported.
     """
-    module = load_extra("viser", "view", "the viewer")
+    module = load_extra("viser", "the viewer")
     _check_free(host, port)
     with _quiet():
         server = module.ViserServer(host, port, verbose=False)

@@ -18,11 +18,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_iter, tree_map
 
 from mi_nerfattack.errors import InputError, is_interrupt
+from mi_nerfattack.extras import load_extra
 from mi_nerfattack.io import files
 from mi_nerfattack.policy.checks import misfit
 from mi_nerfattack.policy.onnx.call import Call
 from mi_nerfattack.policy.onnx.operators import OPERATORS
-from mi_nerfattack.system.extras import load_extra
 
 
 class Budget(TorchDispatchMode):
@@ -290,7 +290,7 @@ def load_onnx(path: Path, rounds: bool = False) -> OnnxNetwork:
             that are not supported, by name.
         SetupError: the package ``onnx`` is not installed.
     """
-    onnx = load_extra("onnx", "onnx", f"{path}: reading it")
+    onnx = load_extra("onnx", f"{path}: reading it")
     raw = files.read_bytes(path, MAX_ONNX_BYTES)
     try:
         model = onnx.load_model_from_string(raw)
@@ -346,12 +346,11 @@ def _opset(model: Any, name: str) -> int:
 
 
 def _node(node: Any, owner: str) -> Node:
-    from onnx import TensorProto
-    from onnx.helper import get_attribute_value
-
+    TensorProto = load_extra("onnx", "a policy of ONNX").TensorProto
+    helper = load_extra("onnx.helper", "a policy of ONNX")
     attributes: dict[str, Any] = {"outputs": len(node.output)}
     for item in node.attribute:
-        value = get_attribute_value(item)
+        value = helper.get_attribute_value(item)
         if isinstance(value, bytes):
             value = value.decode("utf-8", "replace")
         elif isinstance(value, (list, tuple)):
@@ -365,8 +364,7 @@ def _node(node: Any, owner: str) -> Node:
 
 def _tensor(tensor: Any, owner: str) -> torch.Tensor:
     """Read a tensor; floating ones as at least single precision."""
-    from onnx.numpy_helper import to_array
-
+    to_array = load_extra("onnx.numpy_helper", "a policy of ONNX").to_array
     try:
         array = np.array(to_array(tensor))
         if array.dtype.kind in "iub":

@@ -198,5 +198,5 @@ def test_damaged_text(tmp_path, name, text, message):
 def test_without_pycolmap(scene, monkeypatch):
     (scene / "pycolmap.py").write_text("raise ImportError('no wheel')\n")
     monkeypatch.syspath_prepend(str(scene))
-    with pytest.raises(SetupError, match="no wheel; .*pip install pycolmap"):
+    with pytest.raises(SetupError, match=r"\(no wheel\); .*'mi-nerfattack\[photos\]'"):
         read_images(scene)

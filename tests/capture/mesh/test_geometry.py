@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 
 import mitsuba as mi
@@ -17,7 +18,7 @@ from mi_nerfattack.capture.mesh import mesh as meshes
 from mi_nerfattack.capture.mesh import mitsuba_mesh
 from mi_nerfattack.capture.mesh.mitsuba_mesh import MeshArrays, make_mesh, read_mesh
 from mi_nerfattack.capture.mesh.read import load_mesh
-from mi_nerfattack.errors import InputError
+from mi_nerfattack.errors import InputError, SetupError
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -151,8 +152,8 @@ def test_draco_is_read_where_its_package_is_there(tmp_path, monkeypatch):
     for accessor in gltf.tree["accessors"]:
         accessor.pop("bufferView", None)
     with monkeypatch.context() as patch:
-        patch.setattr("mi_nerfattack.capture.mesh.gltf.find_spec", lambda _: None)
-        with pytest.raises(InputError, match="DracoPy"):
+        patch.setitem(sys.modules, "DracoPy", None)
+        with pytest.raises(SetupError, match="a.glb: .* needs DracoPy"):
             load_mesh(gltf.write(tmp_path / "a.glb"))
     box = trimesh.Scene(trimesh.creation.box((1, 2, 3)))
     raw = trimesh.exchange.gltf.export_glb(box, extension_draco=True)

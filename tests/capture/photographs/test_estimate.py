@@ -274,7 +274,7 @@ def test_without_the_package_the_message_names_it(tmp_path, monkeypatch):
     path = tmp_path / "a.heic"
     path.write_bytes(b"\0\0\0\x18ftypheic" + bytes(40))
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    with pytest.raises(InputError, match=f"{path}: .*pillow-heif"):
+    with pytest.raises(SetupError, match=f"{path}: .*pillow_heif"):
         files.read_image(path)
 
 

@@ -20,9 +20,9 @@ from mi_nerfattack.capture.photographs.markers import (
     find_markers,
 )
 from mi_nerfattack.errors import InputError, SetupError
+from mi_nerfattack.extras import install_hint
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import Camera, from_fov, look_at
-from mi_nerfattack.system.extras import install_hint
 
 cv2 = pytest.importorskip("cv2")
 

@@ -15,7 +15,7 @@ from support.faults.injected import wait_for
 from mi_nerfattack.car.devices import DeviceLostError
 from mi_nerfattack.car.tracker.motion_capture import MotionCaptureTracker
 from mi_nerfattack.errors import InputError, SetupError
-from mi_nerfattack.system.extras import install_hint
+from mi_nerfattack.extras import install_hint
 
 STAND_IN = """
 import ctypes, os, time

@@ -29,9 +29,9 @@ from mi_nerfattack.deploy.replay import ros2
 from mi_nerfattack.deploy.replay.environment import open_recording
 from mi_nerfattack.deploy.replay.mcap import McapTopics
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.extras import install_hint
 from mi_nerfattack.io import files
 from mi_nerfattack.io.video import write_video
-from mi_nerfattack.system.extras import install_hint
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -39,11 +39,11 @@ from mi_nerfattack.experiment.view.run import (
 )
 from mi_nerfattack.experiment.view.scene import Contents, object_shapes
 from mi_nerfattack.experiment.view.viewer import Viewer, following
+from mi_nerfattack.extras import install_hint
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov, mount_matrix
 from mi_nerfattack.render.camera.outside import seen_at
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.system.extras import install_hint
 
 pytestmark = pytest.mark.usefixtures("variant")
 

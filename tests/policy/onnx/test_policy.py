@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from mi_nerfattack.errors import InputError, SetupError
+from mi_nerfattack.extras import install_hint
 from mi_nerfattack.policy.inputs import OneHotGoal
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.scenario.policy.kinds import load_policy
-from mi_nerfattack.system.extras import install_hint
 
 onnx = pytest.importorskip("onnx", reason="the extra onnx is not installed")
 pytest.importorskip("onnxruntime", reason="the extra onnx is not installed")
