@@ -134,7 +134,7 @@ class BlackBoxAttack:
         """Return the best objective so far and its cost, one row per judgement.
 
         Returns:
-            (n, 3): see :func:`best_so_far`.
+            (n, 3): see ``best_so_far``.
         """
         frames = np.cumsum([judged.frames for judged in self.history])
         objectives = [judged.objective for judged in self.history]
