@@ -305,6 +305,8 @@ def reported(path: str | Path) -> Iterator[None]:
         yield
     except OSError as err:
         reason = _REASONS.get(err.errno or 0, f"{err.strerror}; check path and disk")
+        if err.errno == errno.ENOENT and not (folder := Path(path).parent).exists():
+            reason += f", there is no folder {folder}"
         raise InputError(f"{path}: {reason}") from err
     except ValueError as err:
         if isinstance(err, InputError):
