@@ -318,3 +318,18 @@ def test_forward_mode_by_the_pose_is_refused(blob, key) -> None:
     with pytest.raises(Exception, match="use dr.backward"):
         dr.forward(number)
     del loss
+
+
+def test_forward_mode_by_the_pose_of_what_an_emitter_shows_is_refused(blob) -> None:
+    lamp = {"type": "field_emitter", "a": blob}
+    cube = {"type": "cube", "to_world": T().scale(8), "emitter": lamp}
+    scene = load({"type": "path"}, {"lamp": cube})
+    params, number = mi.traverse(scene), mi.Float(0)
+    dr.enable_grad(number)
+    key = key_of(params, "blob.to_world")
+    params[key] = move(number, params[key])
+    params.update()
+    dr.forward(number, dr.ADFlag.ClearEdges)
+    loss = pattern(mi.render(scene, params, spp=4))
+    with pytest.raises(Exception, match="use dr.backward"):
+        dr.forward_to(loss)
