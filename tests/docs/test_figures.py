@@ -23,7 +23,6 @@ PENDING = {
     "docs/reference/mujoco.md": 1,
     "docs/reference/roadside.md": 1,
     "docs/results/fields.md": 5,
-    "docs/howto/loop.md": 1,
     "docs/howto/retrain.md": 4,
     "docs/car/index.md": 3,
     "docs/reference/room.md": 1,

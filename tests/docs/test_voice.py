@@ -16,8 +16,6 @@ FOUND = {name: findings_in(name, path) for name, path in pages().items()}
 # Pages that do not pass yet, with their number of findings; it may only fall.
 PENDING = {
     "docs/car/index.md": 29,
-    "docs/howto/loop.md": 9,
-    "docs/howto/plugins.md": 5,
     "docs/howto/policy.md": 17,
     "docs/howto/retrain.md": 29,
     "docs/howto/sweep.md": 27,
