@@ -225,7 +225,8 @@ def test_scenes_of_the_guides_show_something(page):
                     xml = f'<integrator type="field_integrator">{xml}</integrator>'
                 else:
                     xml += f'<integrator type="{kind}"/>'
-            xml = f'<scene version="3.0.0">{xml}{SENSOR}<emitter type="constant"/></scene>'
+            light = '<emitter type="constant"/>'
+            xml = f'<scene version="3.0.0">{xml}{SENSOR}{light}</scene>'
         scene = mi.load_string(xml, parallel=False)
         image = np.array(mi.render(scene, spp=2))
         assert np.isfinite(image).all() and image.std() > 0.02

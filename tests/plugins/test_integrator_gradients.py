@@ -277,7 +277,9 @@ def test_forward_mode_in_every_habit(blob, habit, name) -> None:
     assert found == pytest.approx(expected, rel=1e-3)
 
 
-@pytest.mark.parametrize("key", ["light.radiance.value", "floor.bsdf.reflectance.value"])
+@pytest.mark.parametrize(
+    "key", ["light.radiance.value", "floor.bsdf.reflectance.value"]
+)
 @pytest.mark.parametrize("is_leaf", [True, False])
 def test_forward_mode_by_what_a_nested_prb_shows(blob, key, is_leaf) -> None:
     nested = {"a": blob, "behind": {"type": "prb", "max_depth": 3}}
