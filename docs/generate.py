@@ -25,6 +25,7 @@ from docutils.parsers.rst import Directive, directives
 DOCS = Path(__file__).resolve().parent
 PLUGINS = DOCS.parent / "plugins"
 MARK = "<!-- docs/generate.py writes everything below this line. -->\n"
+LIMITS = "[Limits of all plugins](plugin_limits.md)"
 LANGUAGES = {"xml": "XML", "python": "Python"}
 # What the docstrings use of Mitsuba's own documentation.
 TYPES = (
@@ -83,13 +84,19 @@ def fault_tables() -> str:
 
 
 def with_files(page: str) -> str:
-    """Replace each block of code below a link `[examples/NAME](...):` by the file."""
+    """Replace each block of code below a link `[examples/NAME](...):` by the file.
+
+    Below `[examples/NAME](...), lines 3 to 9:`, the block has these lines of the file.
+    """
 
     def show(match: re.Match[str]) -> str:
-        text = (DOCS / match["file"]).read_text("utf-8")
-        return f"{match['head']}{text}```\n"
+        lines = (DOCS / match["file"]).read_text("utf-8").splitlines(keepends=True)
+        if match["first"]:
+            lines = lines[int(match["first"]) - 1 : int(match["last"])]
+        return f"{match['head']}{''.join(lines)}```\n"
 
-    link = r"^(?P<head>\[(?P<file>examples/[\w.]+)\]\((?P=file)\):\n\n```\w+\n)"
+    part = r"(?:, lines (?P<first>\d+) to (?P<last>\d+))?"
+    link = rf"^(?P<head>\[(?P<file>examples/[\w.]+)\]\((?P=file)\){part}:\n\n```\w+\n)"
     return re.sub(rf"{link}.*?^```\n", show, page, flags=re.M | re.S)
 
 
@@ -111,7 +118,7 @@ def plugin_reference() -> str:
             )
             contents.append(f"- [{heading}](#{anchor})")
             parts = [part for node in body for part in block(node)]
-            sections += [f"## {heading}", picture, *parts]
+            sections += [f"## {heading}", picture, *parts, LIMITS]
     return "\n".join(contents) + "\n\n" + "\n\n".join(sections) + "\n"
 
 

@@ -90,7 +90,10 @@ class FieldEmitter(mi.Emitter):
     a large shape lights surfaces without bias, but with noise.
 
     Differentiable in forward and backward mode with respect to the fields' parameters
-    under ``path``, ``direct`` and ``prb``, but not with respect to rays and the shape.
+    under ``path``, ``direct`` and ``prb``, and in backward mode with respect to
+    ``to_world`` of the fields. The sensor and the shape have no derivative here. In
+    forward mode, call ``dr.forward_from`` before rendering: a ``dr.forward`` after it
+    returns 0.
     Mitsuba 3.9's ``prb`` fails in forward mode with any emitter in spectral variants.
 
     Excluded, so fields are missing there or too bright:

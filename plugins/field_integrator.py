@@ -94,8 +94,7 @@ class FieldIntegrator(FilmIntegrator):
     The composite is ``interleaved`` (one march, ``sigma = sum sigma_k``, ``L = sum
     sigma_k L_k / sigma``) or ``depth`` (each field alone, folded front to back by
     expected depth, ``I = I_f + (1 - a_f) I_b``, A.4 to A.6); they agree where fields do
-    not overlap. A ``splat_background`` is a layer of ``depth`` alone, and takes no
-    derivatives.
+    not overlap. A ``splat_background`` is a layer of ``depth`` alone.
 
     With ``aovs``, the image has more channels: ``opacity`` and ``depth`` (metres) of
     the composite. Each field adds ``<id>.R``, ``<id>.G``, ``<id>.B`` (premultiplied),

@@ -171,17 +171,19 @@ def push_forward(
             "composite interleaved: the shares of single fields have no tangents; "
             "set composite to depth, or aovs to false"
         )
+    t_behind = None
+    if integrator.differentiates_behind:
+        nested, mode = integrator.behind, dr.ADMode.Forward
+        t_behind, *_ = sample_nested(
+            nested, mode, scene, sampler, ray, rays.active, state_in=state.inner
+        )
     with dr.resume_grad():
         leaf = state.copy()
         dr.enable_grad(leaf.seen, leaf.behind)
         dr.set_grad(leaf.seen.total, tangent.total)
         for layer, part in zip(leaf.seen.layers, tangent.layers, strict=False):
             dr.set_grad(layer, part)
-        if integrator.differentiates_behind:
-            nested, mode = integrator.behind, dr.ADMode.Forward
-            t_behind, *_ = sample_nested(
-                nested, mode, scene, sampler, ray, rays.active, state_in=state.inner
-            )
+        if t_behind is not None:
             dr.set_grad(leaf.behind, t_behind)
         colour = lay_over(integrator, leaf.seen.total, rays, leaf.behind, ray)
         found = colour, *integrator.splats(leaf)

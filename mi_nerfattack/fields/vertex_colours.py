@@ -89,10 +89,10 @@ class VertexColours:
         Raises:
             InputError: another shape, or a colour that is not between 0 and 1.
         """
-        if tuple(value.shape) != tuple(self.value.shape):
-            raise InputError(
-                f"colour: shape {tuple(value.shape)}; expected {self.value.shape}"
-            )
+        # `value` may be the tensor that `mi.traverse` shows and a user has resized
+        expected = (dr.width(self._raw) // 3, 3)
+        if tuple(value.shape) != expected:
+            raise InputError(f"colour: shape {tuple(value.shape)}; expected {expected}")
         flat = mi.Float(value.array)
         good = dr.detach((flat > 0) & (flat < 1))
         if not dr.all(good):

@@ -59,7 +59,7 @@ Row = tuple[Finite, Finite, Finite, Finite]
 
 #: Of `[scene]`, what only drives in the surrogate depend on.
 SURROGATE_KEYS = ("field", "composite", "spp", "step_m", "stop", "to_world")
-#: Rays per pixel with which the objective is smooth: docs/howto/loop.md.
+#: Rays per pixel with which the objective is smooth: docs/results/roughness.md.
 SMOOTH_SPP = 9
 _LONGEST = 1_000_000  # control periods of a drive
 Periods = Annotated[int, Field(ge=1, lt=_LONGEST)]

@@ -7,6 +7,7 @@ import runpy
 import subprocess
 import sys
 from pathlib import Path
+from textwrap import dedent
 
 import mitsuba as mi
 import numpy as np
@@ -24,7 +25,8 @@ SCRIPTS = sorted((DOCS / "examples").glob("*_user.py"))
 
 def blocks(language: str, page: str = "README.md") -> list[str]:
     text = (ROOT / page).read_text("utf-8")
-    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.M | re.S)
+    fence = rf"^( *)```{language}\n(.*?)^\1```$"  # indented in a list
+    return [dedent(block) for _, block in re.findall(fence, text, re.M | re.S)]
 
 
 def run(folder: Path, *words: object) -> list[str]:
@@ -209,6 +211,25 @@ def test_mistakes_are_told(tmp_path, old, new, end):
     (tmp_path / "page.md").write_text(PAGE.replace(old, new))
     done = follow(tmp_path / "page.md")
     assert done.returncode == 1 and end in done.stdout
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("page", ["plugins", "glass", "light", "media"])
+def test_scenes_of_the_guides_show_something(page):
+    """Each one, in light and before a camera where the page has none."""
+    for xml in blocks("xml", f"docs/howto/{page}.md"):
+        if "<scene" not in xml:
+            if "<integrator" not in xml:
+                kind = "volpath" if page == "media" else "path"
+                if xml.startswith("<volume"):
+                    xml = f'<integrator type="field_integrator">{xml}</integrator>'
+                else:
+                    xml += f'<integrator type="{kind}"/>'
+            light = '<emitter type="constant"/>'
+            xml = f'<scene version="3.0.0">{xml}{SENSOR}{light}</scene>'
+        scene = mi.load_string(xml, parallel=False)
+        image = np.array(mi.render(scene, spp=2))
+        assert np.isfinite(image).all() and image.std() > 0.02
 
 
 @pytest.mark.slow

@@ -29,7 +29,6 @@ PENDING = {
     "docs/reference/mujoco.md": 1,
     "docs/reference/roadside.md": 1,
     "docs/results/fields.md": 5,
-    "docs/howto/loop.md": 1,
     "docs/results/retrain.md": 4,
     "docs/results/car.md": 2,
     "docs/reference/room.md": 1,

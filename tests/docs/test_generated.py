@@ -88,3 +88,9 @@ def test_files_replace_the_blocks_below_their_links():
         generate.with_files(f"{link}```xml\nold\n{kept}")
         == f"{link}```xml\n{wall}{kept}"
     )
+    part = link.replace(":\n\n", ", lines 2 to 3:\n\n")
+    second_and_third = "".join(wall.splitlines(keepends=True)[1:3])
+    assert (
+        generate.with_files(f"{part}```xml\nold\n{kept}")
+        == f"{part}```xml\n{second_and_third}{kept}"
+    )

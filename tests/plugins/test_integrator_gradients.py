@@ -277,6 +277,37 @@ def test_forward_mode_in_every_habit(blob, habit, name) -> None:
     assert found == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    "key", ["light.radiance.value", "floor.bsdf.reflectance.value"]
+)
+@pytest.mark.parametrize("is_leaf", [True, False])
+def test_forward_mode_by_what_a_nested_prb_shows(blob, key, is_leaf) -> None:
+    nested = {"a": blob, "behind": {"type": "prb", "max_depth": 3}}
+    expected = Case(load(nested, room()), key, "add").gradient()
+    scene = load(nested, room())
+    params, number = mi.traverse(scene), mi.Float(0)
+    source = params[key] if is_leaf else number
+    dr.enable_grad(source)
+    if not is_leaf:
+        params[key] = params[key] + number
+    params.update()
+    loss = pattern(mi.render(scene, params, spp=128, seed=5, seed_grad=7))
+    dr.forward(source)
+    assert float(dr.grad(loss).array[0]) == pytest.approx(expected, rel=1e-3)
+
+
+def test_forward_mode_by_a_field_that_an_emitter_shares(blob) -> None:
+    expected = Case(behind_glass("prb", blob), "blob.density", "add").gradient()
+    scene = behind_glass("prb", blob)
+    params = mi.traverse(scene)
+    key = key_of(params, "blob.density")
+    dr.enable_grad(params[key])
+    params.update()
+    loss = pattern(mi.render(scene, params, spp=128, seed=5, seed_grad=7))
+    dr.forward(params[key])
+    assert float(dr.grad(loss).array[0]) == pytest.approx(expected, rel=1e-3)
+
+
 @pytest.mark.parametrize("key", ["fields.blob.to_world", "camera.to_world"])
 def test_forward_mode_by_the_pose_is_refused(blob, key) -> None:
     scene = load({"a": blob})
@@ -289,3 +320,18 @@ def test_forward_mode_by_the_pose_is_refused(blob, key) -> None:
     with pytest.raises(Exception, match="use dr.backward"):
         dr.forward(number)
     del loss
+
+
+def test_forward_mode_by_the_pose_of_what_an_emitter_shows_is_refused(blob) -> None:
+    lamp = {"type": "field_emitter", "a": blob}
+    cube = {"type": "cube", "to_world": T().scale(8), "emitter": lamp}
+    scene = load({"type": "path"}, {"lamp": cube})
+    params, number = mi.traverse(scene), mi.Float(0)
+    dr.enable_grad(number)
+    key = key_of(params, "blob.to_world")
+    params[key] = move(number, params[key])
+    params.update()
+    dr.forward(number, dr.ADFlag.ClearEdges)
+    loss = pattern(mi.render(scene, params, spp=4))
+    with pytest.raises(Exception, match="use dr.backward"):
+        dr.forward_to(loss)

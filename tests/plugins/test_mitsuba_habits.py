@@ -75,6 +75,15 @@ def test_a_colour_that_is_none_is_refused(blob, value: float) -> None:
         params.update()
 
 
+@pytest.mark.parametrize("rows", [-1, 1])
+def test_colours_of_another_number_of_vertices_are_refused(blob, rows: int) -> None:
+    params = mi.traverse(load({"a": blob}))
+    count = params[KEY].shape[0]
+    params[KEY] = mi.TensorXf(np.full((count + rows, 3), 0.5, np.float32))
+    with pytest.raises(Exception, match=rf"expected \({count}, 3\)"):
+        params.update()
+
+
 def test_a_film_gets_another_size_after_loading(blob) -> None:
     scene = load({"a": blob, "aovs": True})
     shown(scene)

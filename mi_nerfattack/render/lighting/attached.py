@@ -7,6 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.composite import AbstractComposite, Seen
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
@@ -29,6 +30,9 @@ def attached(
 
     Returns:
         premultiplied radiance (3, n) and opacity (n,).
+
+    Raises:
+        InputError: forward mode by a pose, when the tangent is computed.
     """
     # Stock integrators switch recorded loops off to be differentiated themselves.
     with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
@@ -72,6 +76,10 @@ class _Render(dr.CustomOp):
         return self.seen.total.radiance, self.seen.total.opacity
 
     def forward(self) -> None:
+        if any(item.has_pose_gradients for item in self.fixed[0]):
+            raise InputError(
+                "to_world: has no derivative in forward mode; use dr.backward"
+            )
         tangent = self.composite.forward(*self.fixed, self.seen, self.stop)
         self.set_grad_out((tangent.total.radiance, tangent.total.opacity))
 
