@@ -124,14 +124,14 @@ def attack(drives: pd.DataFrame) -> Finding:
     return Finding(
         title,
         (
-            f"In the environment `{where}`, the attack moves the car {found.one:.2f} m "
+            f"In the environment `{where}`, the attack moves the car {found.one:.3f} m "
             f"from the lane centre on average, and the worst random texture "
-            f"{found.other:.2f} m (ratio {found.ratio:.1f}, "
+            f"{found.other:.3f} m (ratio {found.ratio:.1f}, "
             f"{interval_words(found.ratio_ci95, 1)}).",
-            f"The attack is farther at {places}, and at {out} places a wheel is out of "
-            "the lane for a second on average over the drives (share: "
-            f"{interval_words(share_interval(out, found.attacks), 2)}).",
-            f"The mean difference is {found.difference:.2f} m, and its standard "
+            f"The attack is farther at {places}. At {out} places, a wheel is outside "
+            "of the lane for at least a second, on average over the drives of a place "
+            f"(share: {interval_words(share_interval(out, found.attacks), 2)}).",
+            f"The mean difference is {found.difference:.3f} m, and its standard "
             f"deviation between the places of a route is {metres(found.spread)}.",
         ),
         ["texture", "environment", "mean error (m)", "95 % interval", "a wheel out"],
@@ -154,7 +154,7 @@ def _threats_to_attack(
     """
     if ratio_ci95 is not None and ratio_ci95[0] <= 1:
         yield (
-            "The interval of the ratio of the means contains 1, because few attacks "
+            "The interval of the ratio of the means contains 1, because a few attacks "
             "are much stronger than the others. So the title counts places."
         )
     own, random = by_case[ATTACK], by_case[BEST_RANDOM]
@@ -164,9 +164,9 @@ def _threats_to_attack(
         f"up to {own['frames'].max():,}. [The page about the gradient](gradient.md) "
         "compares at equal cost."
     )
-    left = own.groupby("route", sort=False)["departed"].sum()
-    counts = ", ".join(f"{route} {drives}" for route, drives in left.items())
-    yield f"Drives that leave the lane, by route: {counts}."
+    left = own.groupby("route", sort=False)["departed"].agg(["sum", "size"])
+    counts = ", ".join(f"{route} {x} of {n}" for route, x, n in left.itertuples())
+    yield f"Few routes matter. Drives that leave the lane, by route: {counts}."
     means = _by_place(own)
     yield (
         f"One place, {_name(means.idxmax())}, has a mean error of {means.max():.2f} m. "
@@ -213,7 +213,8 @@ def gradient(drives: pd.DataFrame) -> Finding:
             f"The closest other search is `{close}`: the gradient moves the car "
             f"{nearest.ratio:.2f} times as far "
             f"({interval_words(nearest.ratio_ci95, 2)}).",
-            f"Compared with each of these searches, the gradient is farther at "
+            f"Compared with each of the {len(fair)} searches at equal cost, the "
+            "gradient is farther at "
             f"{min(wins)} to {max(wins)} of {nearest.attacks} places.",
         ),
         [
@@ -248,9 +249,11 @@ def _threats_to_gradient(
     places = own.groupby(["scenario", "seed", "method"])[ERROR].mean().unstack()
     behind = places[places[GRADIENT] < places[fair].max(axis=1)]
     for place, error in behind[GRADIENT].items():
+        others = places.loc[place, fair]
+        names = ", ".join(f"`{name}`" for name in others.index[others > error])
         yield (
-            f"At {_name(place)}, another search is better: the gradient has "
-            f"{error:.2f} m."
+            f"At {_name(place)}, the gradient has {error:.2f} m, and these searches "
+            f"have more: {names}."
         )
 
 
@@ -260,7 +263,7 @@ def searches(drives: pd.DataFrame) -> Finding:
     errors = own.groupby(["method", "route"], sort=False)[ERROR].mean().unstack()
     rank = errors.dropna().map(math.log).mean(axis=1).map(math.exp)
     best = str(rank.idxmax())
-    title = f"Of {len(rank)} searches, `{best}` moves the car farthest"
+    title = "Not yet known which search by gradient is best: one place per route"
     spread = own.groupby("cell")[ERROR].std().mean()
     return Finding(
         title,
@@ -289,13 +292,15 @@ def flat(drives: pd.DataFrame) -> Finding:
     groups = groups.loc[[case for case in _CASES if case in groups.index]]
     left, count = groups["drives_departed"], groups["drives"]
     shares = {_CASES[case]: left[case] / count[case] for case in groups.index}
+    interval_of_share = share_interval(left[ATTACK], count[ATTACK])
     percent = f"{100 * shares[_CASES[ATTACK]]:.0f} %"
     title = f"Flat objects send the car out of its lane in {percent} of the drives"
     return Finding(
         title,
         (
             f"With the attacked picture, {left[ATTACK]} of {count[ATTACK]} drives "
-            "leave the lane in the path-traced scene that lights the picture.",
+            "leave the lane in the path-traced scene, where sun and sky of the scene "
+            f"light the picture (share: {interval_words(interval_of_share, 2)}).",
             f"With random pictures, {left[RANDOM]} of {count[RANDOM]} drives leave the "
             "lane.",
             "The aim that we set before the first result is 60 % of the drives with "

@@ -94,7 +94,7 @@ def _print_files(
     shown = {
         "report.html": "everything on one page",
         "overhead.png": "all drives from above",
-        "triptych.png": "unperturbed, attacked and transferred, over the ground",
+        "triptych.png": "original, attacked and transferred, over the ground",
         "strip.png": "what the policy sees",
         "attribution*.png": "when and where the failure is made",
         "frames/": "EXR frames with layers, and as recordings for replay",

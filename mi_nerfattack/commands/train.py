@@ -70,7 +70,8 @@ class Train:
     more: tuple[Path, ...] = ()
     """Folders of earlier collections to train on, too."""
     start: Path | None = None
-    """Policy whose weights training starts with."""
+    """Policy whose weights training starts with, for example of the package:
+    bundled:policy/pilotnet.safetensors."""
     skies: tuple[str, ...] = ()
     """Times of day, as of evaluate; all by default."""
     exposures_ev: tuple[float, ...] = ()
@@ -116,6 +117,7 @@ class Train:
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.policy.pilotnet import PilotNet
         from mi_nerfattack.report.table import card_table
+        from mi_nerfattack.scenes import resolve
         from mi_nerfattack.system.workers import Processes, available_cores
         from mi_nerfattack.training.imitate import collect_frames, imitate
         from mi_nerfattack.training.record import (
@@ -139,7 +141,7 @@ class Train:
             counts = count_frames(self.data, shards)
             lines = [f"{self.data / name}: {n} frames" for name, n in counts.items()]
             return Result({"data": counts}, lambda: print("\n".join(lines)))
-        start = None if self.start is None else PilotNet.load(self.start)
+        start = self.start and PilotNet.load(resolve(str(self.start)))
         more = self._more()
         with StageBars() as bars:
             result = imitate(

@@ -201,7 +201,7 @@ def _replayed(name: str, replayed: Figures) -> Iterator[str]:
         yield (
             f"In the recording {name} it changes the control by {changes[ATTACK]:.3f} "
             f"{replayed['control_unit']} on average, {ratio:.1f} times as much as "
-            "random looks; nothing that the policy does has an effect there."
+            "random textures; nothing that the policy does has an effect there."
         )
 
 
@@ -257,7 +257,7 @@ def run_flags(
     curve = document.get("curve")
     if by_gradient and curve is not None:
         looks = _random_curve(curve["frames"][0], document["baseline"]["objectives"])
-        yield from black_box_better(curve, {"random looks": looks})
+        yield from black_box_better(curve, {"random textures": looks})
     for environments in document["routes"].values():
         for name, cases in environments.items():
             yield from _random_enough(name, cases)

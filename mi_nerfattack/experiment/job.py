@@ -195,7 +195,7 @@ class Job:
         work = Judgements(folder.path / LOOKS, decisive, scenario, judge)
 
         def progress(done: int, total: int) -> None:
-            self.on_progress("surrogate: random looks", done, total, "")
+            self.on_progress("surrogate: random textures", done, total, "")
 
         baseline.judge(work, self.workers, progress, cases.counter())
         cases.looks[RANDOM] = baseline.looks(0)

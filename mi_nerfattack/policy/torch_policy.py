@@ -71,9 +71,9 @@ def call_module(
         if wanted not in (None, shapes[0]):
             raise InputError(f"{name}: {misfit(wanted, shapes[0])}") from err
         raise InputError(
-            f"{name}: fails on an input of shape {shapes[0]}, with goal and hidden "
-            f"states {shapes[1:]}: {type(err).__name__}: {err}; declare "
-            "policy.preprocess, goal and recurrent as the network needs them"
+            f"{name}: fails on an input of shape {shapes[0]}, with further "
+            f"inputs of shapes {shapes[1:]}: {type(err).__name__}: {err}; declare "
+            "policy.preprocess, inputs, goal and recurrent as the network needs them"
         ) from err
     return _tensors(result, name)
 

@@ -57,9 +57,9 @@ def metrics_table(document: Document) -> Table:
         Column("departed", "drives_departed", short="drives\nout", bad=True),
     ]
     caption = (
-        "Mean and maximum over all steps and runs. The interval is over random looks, "
-        "of five or more; cases of one look have none, since their runs differ in the "
-        "start alone. Times are means over the runs; departed runs had a wheel out."
+        "Mean and maximum over all steps and runs. The interval is over random "
+        "textures, of five or more; cases of one texture have none, since their runs "
+        "differ in the start alone. Times are means over the runs; departed runs had a wheel out."
     )
     if (objective := document.get("objective")) is not None:
         caption += (
@@ -154,7 +154,7 @@ def headline_table(runs: Sequence[RunPart]) -> Table:
     ]
     caption = (
         "Mean distances from the lane centre (m); what the attack does as a multiple "
-        "of random looks; seconds with a wheel out past the attack, mean over its "
+        "of random textures; seconds with a wheel out with the attack, mean over its "
         "drives, and how many of its drives have any."
     )
     rows = [

@@ -97,7 +97,7 @@ class AbstractGradientMethod(AbstractMethod):
             refuse(
                 "opening_share",
                 f"{self.opening_share:g} of {count} iterations for {self._tries} "
-                f"tries; each takes at least {FEWEST}, and one is to be left over",
+                f"tries; each try takes at least {FEWEST}, and one is left over",
             )
         return self
 

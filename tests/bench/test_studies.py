@@ -124,7 +124,7 @@ def test_the_attack_is_compared_with_the_worst_random_texture():
     rows = drives(table(errors), table(errors).assign(environment="mitsuba"))
     found = made("attack", rows)
     assert found.title.endswith("at 6 of 6 places")
-    assert "0.40 m" in found.sentences[0] and "ratio 1.3" in found.sentences[0]
+    assert "0.400 m" in found.sentences[0] and "ratio 1.3" in found.sentences[0]
     rows.loc[rows["case"] == "attack", "cross_track_mean_m"] = 0.25
     assert "not shown" in made("attack", rows).title
 

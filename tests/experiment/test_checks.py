@@ -307,7 +307,7 @@ def test_a_sound_scenario(scenario_folder, capsys):
     assert "80.0 m, 4 control periods of 0.1 s; objects: ball" in first
     # 4 periods of: 3 iterations and the attribution's 3, two frames each; 2 looks and
     # the best judged; 4 cases of 2 drives and the looks in both worlds
-    assert "at most 3 iterations, 2 random looks, 140 frames; about " in cost
+    assert "at most 3 iterations, 2 random textures, 140 frames; about " in cost
     # 3 iterations there and back, 4 cases of 2 drives and the looks in both worlds
     scenario, _ = load_scenario(scenario_folder / "changed.toml")
     assert planned_periods(scenario) == 4 * (2 * 3 + 2 * (4 * 2 + 2))

@@ -58,7 +58,7 @@ def test_interrupted_deterministic_run_ends_bit_for_bit_as_the_whole(folder, tmp
 
 def test_what_is_finished_is_not_repeated(folder, whole, tmp_path):
     output, seen = tmp_path / "run", []
-    interrupt(folder, output, "surrogate: random looks", 3)  # in the second of 2
+    interrupt(folder, output, "surrogate: random textures", 3)  # in the second of 2
     assert len(list(output.glob("looks/*"))) == 1
     # 2 of each of 5 cases twice, of 2 steps each; in the last
     interrupt(folder, output, "drives", 2 * 20 - 1)

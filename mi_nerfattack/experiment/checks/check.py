@@ -299,7 +299,7 @@ def sentences(
     if cost is not None:
         lines.append(
             f"cost: at most {cost.iterations} iterations, {cost.random_looks} random "
-            f"looks, {cost.frames} frames; about {duration(cost.wall_s)} as busy as "
+            f"textures, {cost.frames} frames; about {duration(cost.wall_s)} as busy as "
             f"this machine is, {math.ceil(cost.memory_mb / 100) / 10:.1f} GB of "
             f"memory, {cost.disk_mb:.0f} MB of disk"
         )

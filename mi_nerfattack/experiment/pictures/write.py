@@ -110,7 +110,7 @@ def _write_triptych(output: Path, done: Finished) -> None:
             ground = surrogate_above(world.surrogate, above)
         else:
             ground = Paster(above.camera, objects).paste(bare).image
-        name = "unperturbed" if case == OWN else case
+        name = "original" if case == OWN else case
         title = f"({chr(97 + len(panels))}) {name}, {label}"
         panels.append(Panel(title, drives, object_footprints(objects), ground))
     world.show(done.look(ATTACK))

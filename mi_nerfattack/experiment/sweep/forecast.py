@@ -144,7 +144,7 @@ def sentences(document: dict[str, Any], workers: int) -> list[str]:
         if cost is not None and cost["period_s"]["backward"]:
             times = cost["period_s"]
             multiple = times["backward"] / times["forward"]
-            lines.append(f"{name}: a pass back costs {multiple:.1f} drives")
+            lines.append(f"{name}: a backward pass costs {multiple:.1f} drives")
     for word in ("refused", "doubts"):
         shown = "refused" if word == "refused" else "look at"
         for place, told in document[word].items():

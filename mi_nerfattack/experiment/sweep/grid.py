@@ -83,7 +83,7 @@ class Grid(Section):
     objects: tuple[ObjectsChoice, ...] = ()
     methods: tuple[MethodChoice, ...] = ()
     budgets: tuple[Count, ...] = ()  # rendered frames; as the scenario says
-    backward_multiple: NonNegative | None = None  # cost of a pass back, in drives
+    backward_multiple: NonNegative | None = None  # cost of a backward pass, in drives
     seeds: Annotated[tuple[Seed, ...], Field(min_length=1)] = (0,)
     anyway: bool = False  # attack although it would prove nothing
     pictures: bool = False  # write frames, plots and page of each attack
@@ -269,8 +269,8 @@ class GridReader:
         if multiple is None:
             raise InputError(
                 f"{self.path}: backward_multiple: is missing; budgets of gradients "
-                "count a pass back as so many drives: check of a grid without budgets "
-                "measures it"
+                "count a backward pass as so many drives: check of a grid without "
+                "budgets measures it"
             )
         iterations = int(budget / ((1 + multiple) * frames))
         if not iterations:

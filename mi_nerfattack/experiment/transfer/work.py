@@ -82,8 +82,8 @@ class TransferDrives(AbstractDrives):
         for found in self.attacks:
             if BEST_RANDOM in self.cases and found.best_random is None:
                 raise InputError(
-                    f"{found.folder}: has no random looks; leave {BEST_RANDOM} out of "
-                    "--cases"
+                    f"{found.folder}: has no random textures; leave {BEST_RANDOM} out "
+                    "of --cases"
                 )
             found.check_starts(self.seed, self.starts)
             for column in self.columns:

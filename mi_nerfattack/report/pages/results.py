@@ -22,7 +22,7 @@ _COST_LABELS: Mapping[str, str] = {
     "checkpoint_s": "of the wall time, in checkpoints (s)",
     "processes": "processes, one and one a resumption",
     "forward_s": "of the wall time, in the attack's drives (s)",
-    "backward_s": "of the wall time, in the passes back through them (s)",
+    "backward_s": "of the wall time, in their backward passes (s)",
 }
 
 

@@ -167,8 +167,9 @@ def misfit(given: str | None, taken: str | None, source: str) -> str:
     if None in (given, taken) or given == taken:
         return ""
     return (
-        f"takes {taken}, and {source} gives {given}; take another of them, or convert "
-        "the control by policy.control_scale"
+        f"takes {taken}, and {source} gives {given}; take another of them, convert "
+        "the control by policy.control_scale, or, with waypoints, change "
+        "policy.trajectory.controls"
     )
 
 
