@@ -59,7 +59,8 @@ def metrics_table(document: Document) -> Table:
     caption = (
         "Mean and maximum over all steps and runs. The interval is over random "
         "textures, of five or more; cases of one texture have none, since their runs "
-        "differ in the start alone. Times are means over the runs; departed runs had a wheel out."
+        "differ in the start alone. Times are means over the runs; departed runs had a "
+        "wheel out."
     )
     if (objective := document.get("objective")) is not None:
         caption += (
