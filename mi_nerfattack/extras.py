@@ -12,7 +12,7 @@ from mi_nerfattack.errors import SetupError
 
 
 @dataclass(frozen=True)
-class Optional:
+class OptionalPackage:
     """A package that the core does without.
 
     Attributes:
@@ -25,29 +25,29 @@ class Optional:
 
 
 #: Packages by the name that Python imports. pyproject.toml lists the same extras.
-OPTIONAL: Mapping[str, Optional] = {
-    "DracoPy": Optional("formats", "DracoPy"),
-    "av": Optional("video", "av"),
-    "carla": Optional("carla", "carla"),
-    "cv2": Optional("markers", "opencv-python-headless"),
-    "gymnasium": Optional("gym", "gymnasium"),
-    "lz4": Optional("mcap", "lz4"),
-    "matplotlib": Optional("report", "matplotlib"),
-    "mcap": Optional("mcap", "mcap"),
-    "mcap_ros2": Optional("mcap", "mcap-ros2-support"),
-    "motioncapture": Optional("motion-capture", "motioncapture"),
-    "mujoco": Optional("mujoco", "mujoco"),
-    "onnx": Optional("onnx", "onnx"),
-    "optuna": Optional("bayesian", "optuna"),
-    "pandas": Optional("report", "pandas"),
-    "pillow_heif": Optional("formats", "pillow-heif"),
-    "pycolmap": Optional("photos", "pycolmap"),
-    "ray": Optional("ray", "ray"),
-    "skimage": Optional("mesh", "scikit-image"),
-    "submitit": Optional("submitit", "submitit"),
-    "trimesh": Optional("mesh", "trimesh"),
-    "viser": Optional("view", "viser"),
-    "zstandard": Optional("mcap", "zstandard"),
+OPTIONAL: Mapping[str, OptionalPackage] = {
+    "DracoPy": OptionalPackage("formats", "DracoPy"),
+    "av": OptionalPackage("video", "av"),
+    "carla": OptionalPackage("carla", "carla"),
+    "cv2": OptionalPackage("markers", "opencv-python-headless"),
+    "gymnasium": OptionalPackage("gym", "gymnasium"),
+    "lz4": OptionalPackage("mcap", "lz4"),
+    "matplotlib": OptionalPackage("report", "matplotlib"),
+    "mcap": OptionalPackage("mcap", "mcap"),
+    "mcap_ros2": OptionalPackage("mcap", "mcap-ros2-support"),
+    "motioncapture": OptionalPackage("motion-capture", "motioncapture"),
+    "mujoco": OptionalPackage("mujoco", "mujoco"),
+    "onnx": OptionalPackage("onnx", "onnx"),
+    "optuna": OptionalPackage("bayesian", "optuna"),
+    "pandas": OptionalPackage("report", "pandas"),
+    "pillow_heif": OptionalPackage("formats", "pillow-heif"),
+    "pycolmap": OptionalPackage("photos", "pycolmap"),
+    "ray": OptionalPackage("ray", "ray"),
+    "skimage": OptionalPackage("mesh", "scikit-image"),
+    "submitit": OptionalPackage("submitit", "submitit"),
+    "trimesh": OptionalPackage("mesh", "trimesh"),
+    "viser": OptionalPackage("view", "viser"),
+    "zstandard": OptionalPackage("mcap", "zstandard"),
 }
 
 
