@@ -70,8 +70,7 @@ class Train:
     more: tuple[Path, ...] = ()
     """Folders of earlier collections to train on, too."""
     start: Path | None = None
-    """Policy whose weights training starts with, for example of the package:
-    bundled:policy/pilotnet.safetensors."""
+    """Policy with the first weights, also bundled:FILE."""
     skies: tuple[str, ...] = ()
     """Times of day, as of evaluate; all by default."""
     exposures_ev: tuple[float, ...] = ()

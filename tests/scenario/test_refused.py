@@ -92,7 +92,7 @@ route = "lane" -> => :2: scene.route: is missing
 [vehicle]; delay_steps = -1 => vehicle.delay_steps: .*0
 [vehicle]; kind = "ackermann_rate"; steer_time_s = 0.03; substeps = 1
   => :15: vehicle.steer_time_s: .* rk4: .* raise substeps
-[deployment]; kind = "gazebo" => deployment.kind: is 'gazebo'; .*"mitsuba", .*"replay"
+[deployment]; kind = "gazebo" => deployment.kind: is 'gazebo'; one of mitsuba, .*replay
 [deployment]; kind = "replay" => deployment.recording: is missing
 [deployment]; kind = "carla"; objects = "built-in" => objects: has no meaning
 [deployment]; spp = 0 => deployment.spp: .*greater
