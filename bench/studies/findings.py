@@ -248,9 +248,9 @@ def _threats_to_gradient(
             )
     places = own.groupby(["scenario", "seed", "method"])[ERROR].mean().unstack()
     behind = places[places[GRADIENT] < places[fair].max(axis=1)]
-    for place, error in behind[GRADIENT].items():
-        others = places.loc[place, fair]
-        names = ", ".join(f"`{name}`" for name in others.index[others > error])
+    for place, errors in behind.iterrows():
+        error = errors[GRADIENT]
+        names = ", ".join(f"`{name}`" for name in fair if errors[name] > error)
         yield (
             f"At {_name(place)}, the gradient has {error:.2f} m, and these searches "
             f"have more: {names}."
