@@ -205,7 +205,7 @@ def test_all_of_them_in_one_scenario(tmp_path, rng):
     assert plain in xml.read_text() and stripes is not None
     xml.write_text(xml.read_text().replace(plain, stripes[0]))
     path, run, table = folder / "scenario.toml", tmp_path / "run", tmp_path / "table"
-    assert cli.main(["check", str(path)]) == 0
+    assert cli.main(["check", str(path), "-o", str(tmp_path / "check.png")]) == 0
     words = ["attack", str(path), "-o", str(run), "--workers", "1", "--anyway"]
     assert cli.main(words) == 0
     values = json.loads((run / "metrics.json").read_text())["scenario"]
