@@ -20,7 +20,6 @@ import textwrap
 import traceback
 from collections.abc import Mapping, Sequence
 from functools import reduce
-from importlib.util import find_spec
 from typing import Annotated, Any, get_type_hints
 
 import docstring_parser
@@ -240,10 +239,8 @@ def _tell(command: Command) -> int:
 
 def _check_packages(command: Command, commands: Commands) -> None:
     """Raise SetupError where an optional package that a command needs is missing."""
-    for words, kind in each(commands):
-        needed = PACKAGES.get(kind, ()) if kind is type(command) else ()
-        if not all(map(find_spec, needed)):
-            require(" ".join(words), *needed)
+    (words,) = (words for words, kind in each(commands) if kind is type(command))
+    require(" ".join(words), *PACKAGES.get(type(command), ()))
 
 
 def _check_name(arguments: Sequence[str], commands: Commands, group: str = "") -> None:

@@ -249,7 +249,7 @@ class Scenario(Section):
                 f"environments called {labels}; give each a name of its own, which is "
                 f"not {SURROGATE}",
             )
-        if model == "custom" or self.vehicle.unit == "other":
+        if not self.vehicle.fits_wheels:
             for label, section in sections:
                 if section.kind.startswith("mujoco"):
                     refuse(

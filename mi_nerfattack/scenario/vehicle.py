@@ -58,6 +58,7 @@ class AbstractVehicleSection(Section):
     delay_steps: Whole = 0  # integration steps
     width_m: Positive = 1.8
     group: ClassVar[str] = "mi_nerfattack.vehicles"
+    has_wheels: ClassVar[bool] = True
 
     @abstractmethod
     def build(self) -> AbstractDynamics:
@@ -95,6 +96,11 @@ class AbstractVehicleSection(Section):
     def unit(self) -> str | None:
         """Unit of the control; None where a custom vehicle does not say it."""
         return self.car().control_unit
+
+    @property
+    def fits_wheels(self) -> bool:
+        """Whether MuJoCo's car, which has wheels, takes the control."""
+        return self.has_wheels and self.unit != "other"
 
     @property
     def has_expert(self) -> bool:
@@ -299,6 +305,7 @@ class CustomSection(AbstractVehicleSection):
     """A function of the user's."""
 
     kind: Literal["custom"]
+    has_wheels: ClassVar[bool] = False
     function: AnyCode
     trust_code: Trust = False  # it runs with all rights of the account
     framework: Literal["drjit", "torch"] = "drjit"  # of the function
@@ -355,11 +362,10 @@ class CustomSection(AbstractVehicleSection):
         if self.framework == "torch":
             from mi_nerfattack.vehicle.torch_model import TorchDynamics as kind
         function = self.function.load("vehicle.function", self.trust_code)
-        limit = self.limits[0] if self.controls == 1 else self.limits
         dynamics = kind(
             function,
             size=self.state_size,
-            limit=limit,
+            limit=self.limits[0] if self.controls == 1 else self.limits,
             rest=self.rest_state,
             controls=self.controls,
         )
@@ -370,21 +376,16 @@ class CustomSection(AbstractVehicleSection):
         (limit, *others), wheelbase = self.limits, self.wheelbase_m
         steered = {"max_steer": limit} if self.control_unit == "rad" else {}
         sizes = {} if wheelbase is None else {"wheelbase": wheelbase}
-        unit = self.control_unit or "other"
         pairs = zip(user_controls(self.controls)[1:], others, strict=True)
         more = [Control(name, "other", -most, most) for name, most in pairs]
-        found = {"max_control": limit, "control_unit": unit, **steered, **sizes}
-        return found | {"more_controls": tuple(more)}
+        found = {"max_control": limit, "control_unit": self.control_unit or "other"}
+        return {**found, **steered, **sizes, "more_controls": tuple(more)}
 
 
 def _steered(wheelbase: float, max_steer_deg: float) -> dict[str, Any]:
     steer = float(np.radians(max_steer_deg))
-    return {
-        "wheelbase": wheelbase,
-        "max_steer": steer,
-        "control_unit": "rad",
-        "max_control": steer,
-    }
+    control = {"control_unit": "rad", "max_control": steer, "max_steer": steer}
+    return {"wheelbase": wheelbase, **control}
 
 
 VehicleSection = Annotated[

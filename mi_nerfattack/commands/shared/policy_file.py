@@ -131,14 +131,8 @@ class PolicyFile:
             option: that names the environments.
             environments: their names.
         """
-        from mi_nerfattack.scenario.vehicle import CustomSection
-
         wheels = [name for name in environments if name.startswith("mujoco")]
-        vehicle = self.vehicle
-        is_custom = isinstance(vehicle, CustomSection) or (
-            vehicle is not None and vehicle.unit == "other"
-        )
-        if wheels and is_custom:
+        if wheels and self.vehicle is not None and not self.vehicle.fits_wheels:
             raise InputError(
                 f"{option}: {wheels[0]} drives a car with wheels, whose control is not "
                 "that of a custom vehicle; leave it out"

@@ -20,7 +20,6 @@ from mi_nerfattack.render.pathtrace.load import DAYLIGHT
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.scenario.deployment import SURROGATE, Deployment
 from mi_nerfattack.scenario.scenario import Scenario
-from mi_nerfattack.scenario.vehicle import CustomSection
 from mi_nerfattack.scenario.world import World
 
 if TYPE_CHECKING:
@@ -221,9 +220,7 @@ class Column:
 
     def check(self, scenario: Scenario) -> None:
         """Raise InputError unless a scenario's vehicle can drive there."""
-        vehicle = scenario.vehicle
-        is_custom = isinstance(vehicle, CustomSection) or vehicle.unit == "other"
-        if is_custom and "mujoco" in self.name:
+        if not scenario.vehicle.fits_wheels and "mujoco" in self.name:
             raise InputError(
                 f"--environments: {self.environment} drives a car with wheels, whose "
                 f"control is not that of the custom vehicle of {scenario.name!r}; "
