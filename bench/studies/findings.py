@@ -166,7 +166,7 @@ def _threats_to_attack(
     )
     left = own.groupby("route", sort=False)["departed"].agg(["sum", "size"])
     counts = ", ".join(f"{route} {x} of {n}" for route, x, n in left.itertuples())
-    yield f"Few routes matter. Drives that leave the lane, by route: {counts}."
+    yield f"Drives that leave the lane, by route: {counts}."
     means = _by_place(own)
     yield (
         f"One place, {_name(means.idxmax())}, has a mean error of {means.max():.2f} m. "
@@ -258,7 +258,10 @@ def _threats_to_gradient(
 
 
 def searches(drives: pd.DataFrame) -> Finding:
-    """Rank the searches by the geometric mean of their attacks over the routes."""
+    """Rank the searches by the geometric mean of their attacks over the routes.
+
+    The grid has one place per route, so the rank alone decides nothing.
+    """
     own = _attacks(drives)
     errors = own.groupby(["method", "route"], sort=False)[ERROR].mean().unstack()
     rank = errors.dropna().map(math.log).mean(axis=1).map(math.exp)

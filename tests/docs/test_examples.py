@@ -7,11 +7,11 @@ import runpy
 import subprocess
 import sys
 from pathlib import Path
-from textwrap import dedent
 
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.pages.blocks import fenced
 
 from mi_nerfattack.experiment.sweep.table import read_table
 from mi_nerfattack.fields import load_grid
@@ -24,9 +24,7 @@ SCRIPTS = sorted((DOCS / "examples").glob("*_user.py"))
 
 
 def blocks(language: str, page: str = "README.md") -> list[str]:
-    text = (ROOT / page).read_text("utf-8")
-    fence = rf"^( *)```{language}\n(.*?)^\1```$"  # indented in a list
-    return [dedent(block) for _, block in re.findall(fence, text, re.M | re.S)]
+    return fenced(ROOT / page, language)
 
 
 def run(folder: Path, *words: object) -> list[str]:

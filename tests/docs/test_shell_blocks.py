@@ -11,10 +11,10 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
-from textwrap import dedent
 
 import pytest
 import tyro
+from support.pages.blocks import fenced
 
 from mi_nerfattack import cli
 from mi_nerfattack.commands import COMMANDS, each
@@ -76,14 +76,8 @@ SKIPPED = {
 
 def blocks(page: Path, languages: tuple[str, ...] = ("",)) -> list[str]:
     """Find the blocks of a page that call us."""
-    fence = r"^( *)```(\w*)\n(.*?)^\1```$"  # indented in a list
-    fenced = re.findall(fence, page.read_text("utf-8"), re.M | re.S)
     ours = r"^(\S*/)?(mi-nerfattack|python -m|make|pip) "
-    return [
-        dedent(text)
-        for _, language, text in fenced
-        if language in languages and re.search(ours, dedent(text), re.M)
-    ]
+    return [text for text in fenced(page, *languages) if re.search(ours, text, re.M)]
 
 
 def name(page: Path) -> str:
