@@ -311,6 +311,7 @@ def read_history(tensors: dict[str, np.ndarray]) -> list[IterationRecord]:
     rows, counts, costs = (tensors[k] for k in ("history", "cost_counts", "costs"))
     if counts.shape != rows.shape[:1] or counts.sum() != len(costs):
         raise InputError(f"{len(rows)} iterations, costs of {len(counts)}")
+    # The costs of all iterations are end to end: cut them where each iteration ends.
     parts = np.split(costs, np.cumsum(counts)[:-1])
     return [
         IterationRecord(int(iteration), *numbers, costs=tuple(part.tolist()))
@@ -332,6 +333,8 @@ def best_so_far(
         (n, 3): frames until then, least objective, its mean |e| in metres.
     """
     values = np.array(objectives, np.float64)
+    # The index of the best so far is that of the last measurement which improved on
+    # all measurements before it; the first of equal measurements stays the best.
     before = np.minimum.accumulate(np.append(np.inf, values[:-1]))[: len(values)]
     best = np.maximum.accumulate(np.where(values < before, np.arange(len(values)), 0))
     return np.column_stack([frames, values[best], np.array(means_m)[best]])

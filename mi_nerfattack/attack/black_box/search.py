@@ -112,6 +112,7 @@ class BlackBoxAttack:
         Raises:
             InputError: the objective is not finite.
         """
+        # Propose, drive, and add what the search charges for the proposal itself.
         asked = self.search.ask()
         judged = self.judge(asked.textures, on_step)
         judged = replace(judged, objective=judged.objective + asked.penalty)
@@ -156,6 +157,8 @@ class BlackBoxAttack:
         rows = tensors["history"]
         if rows.ndim != 2 or rows.shape[1] != len(fields(Judged)):
             raise InputError(f"history: shape {rows.shape}; (n, {len(fields(Judged))})")
+        # A new search of the same seed makes the same proposals, if it learns the same
+        # objectives in the same order. So nobody drives again.
         for objective, mean, largest, frames in rows.tolist():
             judged = Judged(objective, mean, largest, int(frames))
             self._take(self.search.ask(), judged)
