@@ -239,7 +239,7 @@ def _tell(command: Command) -> int:
 
 def _check_packages(command: Command, commands: Commands) -> None:
     """Raise SetupError where an optional package that a command needs is missing."""
-    (words,) = (words for words, kind in each(commands) if kind is type(command))
+    words = next(words for words, kind in each(commands) if kind is type(command))
     require(" ".join(words), *PACKAGES.get(type(command), ()))
 
 
