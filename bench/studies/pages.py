@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import textwrap
 from collections.abc import Sequence
 from os.path import relpath
@@ -26,7 +27,7 @@ def write_pages(
     folder: Path = FOLDER,
     pictures: Path = ROOT / "docs/pictures",
 ) -> list[Path]:
-    """Write a page and a chart for each study that has rows and a finding.
+    """Write a page, a chart and a line of the index for each study with a finding.
 
     Args:
         studies: by default all of the plan.
@@ -47,7 +48,23 @@ def write_pages(
             one = state(study, compare=False)
             files.write_text(page, page_text(study, made, one, relpath(chart, folder)))
             written.append(page)
+            index = folder / "index.md"
+            if index.exists():
+                text = with_answer(index.read_text("utf-8"), page.name, made.title)
+                files.write_text(index, text)
     return written
+
+
+def with_answer(index: str, page: str, title: str) -> str:
+    """Return the text of the index, in which the question of a page has its answer.
+
+    Args:
+        index: Markdown with one item for each page: its question as a link.
+        page: the page's file name.
+        title: the finding.
+    """
+    item = re.compile(rf"^(- \[[^]]*\]\({re.escape(page)}\)).*(?:\n  .*)*", re.M)
+    return item.sub(lambda found: _wrapped(f"{found[1]} {title}.", "  "), index)
 
 
 def _smaller(image: bytes) -> bytes:

@@ -14,7 +14,7 @@ from bench.__main__ import main
 from bench.studies import plan, run
 from bench.studies.charts import draw_heat, draw_ratios
 from bench.studies.findings import FINDINGS, finding, is_farther, is_majority
-from bench.studies.pages import FOLDER, page_text
+from bench.studies.pages import FOLDER, page_text, with_answer
 from bench.studies.plan import ROOT, Study, read_plan, state, wanted_labels
 from mi_nerfattack import cli
 from mi_nerfattack.drives.table import with_starts
@@ -81,6 +81,15 @@ def test_a_page_is_what_its_table_gives(name):
     assert page == text, "run python -m bench results --pages"
     assert 0 < (ROOT / f"docs/pictures/finding_{name}.png").stat().st_size < 100_000
     assert len(made.sentences) == 3 and len(made.pandas.splitlines()) == 2
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_the_index_has_the_answer_beside_the_question(name):
+    made = finding(PAGES[name])
+    assert made is not None
+    index = (FOLDER / "index.md").read_text("utf-8")
+    assert with_answer(index, f"{name}.md", made.title) == index
+    assert f"]({name}.md) {made.title}." in " ".join(index.split())
 
 
 def test_only_findings_with_rows_have_a_page():
