@@ -21,6 +21,7 @@ import gallery_blocks  # noqa: E402
 import light_maps  # noqa: E402
 import plugin_scenes  # noqa: E402
 import run_pictures  # noqa: E402
+import worlds  # noqa: E402
 
 # Each function writes its pictures into a folder; small ones are for tests.
 PICTURES: dict[str, Callable[[Path, bool], None]] = {
@@ -32,6 +33,7 @@ PICTURES: dict[str, Callable[[Path, bool], None]] = {
     "glass": plugin_scenes.glass,
     "light_maps": light_maps.draw_light_maps,
     "plugins": plugin_scenes.plugins,
+    "worlds": worlds.draw_worlds,
 }
 # Each of these shows a finished run, too.
 OF_A_RUN: dict[str, Callable[[Path, Path, bool], None]] = {

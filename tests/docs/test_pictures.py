@@ -32,6 +32,7 @@ PLUGINS = {f"plugin_{name}.jpg" for name in NAMES}
 GALLERY = set(
     re.findall(r"\]\(pictures/(\w+\.jpg)\)", (DOCS / "gallery.md").read_text("utf-8"))
 )
+WORLDS = {"environments.jpg", "cameras.jpg", "room.jpg", "net.jpg"}
 
 
 def read(path: Path) -> np.ndarray:
@@ -77,6 +78,7 @@ def assert_made(names: set[str], folder: Path) -> None:
         ("glass", {"glass.jpg"}),
         ("light_maps", {"light_maps.jpg"}),
         ("gallery", GALLERY),
+        ("worlds", WORLDS),
     ],
 )
 def test_pictures_are_made(name, pictures, tmp_path):
@@ -126,7 +128,8 @@ def test_the_chart_has_a_mark_for_each_drive():
 
 
 @pytest.mark.parametrize(
-    "name", sorted(PLUGINS | GALLERY | {"banner.jpg", "chart.png", "country.jpg"})
+    "name",
+    sorted(PLUGINS | GALLERY | WORLDS | {"banner.jpg", "chart.png", "country.jpg"}),
 )
 def test_committed_pictures_show_something(name):
     assert_shows_something(read(DOCS / "pictures" / name))
