@@ -76,6 +76,8 @@ return found;
 def test_a_reader_uses_the_page_of_results(tmp_path, width):
     for name in ("one", "two"):
         make_run(tmp_path / name)
+        shares = {"gradient_share": {"ball": [0.1, 0.2, 0.6, 0.1]}}
+        files.write_json(tmp_path / name / "attribution.json", shares)
     make_transfer(tmp_path / "moved")
     names = [str(tmp_path / name) for name in ("one", "two", "moved")]
     path = tmp_path / "page.html"
@@ -86,7 +88,7 @@ def test_a_reader_uses_the_page_of_results(tmp_path, width):
         page.wait("document.readyState === 'complete' && !!document.body.children[0]")
         found = page.ask(USE)
         check_alone(page, path.as_uri(), "data:")
-    # farthest out after 0.2 s, where it begins
+    # the slider begins where the gradient has its largest share: after two periods
     assert (found["first"], found["moved"]) == ("0.2 s, -0.30 m", "0.3 s, +0.20 m")
     assert found["at"] == "0px 100%"
     assert found["buttons"] == ["Pause", "Play"]
