@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import io
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
+import numpy as np
 from images import write_jpeg
 from PIL import Image
 from run_pictures import below, beside, titled
 
-from mi_nerfattack.fields import GridField
 from mi_nerfattack.fields.random_textures import random_texture
 from mi_nerfattack.props.attacked import AttackedBox, box_pictures
 from mi_nerfattack.props.net import Net
+from mi_nerfattack.props.overlay import Overlay
 from mi_nerfattack.props.paper import lay_out, pages
-from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.report.plots.charts import RC
 from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.scenario.world import World, build_world
@@ -57,10 +58,11 @@ objects = "built-in"
 
 
 def draw_worlds(folder: Path, small: bool) -> None:
-    """Render one moment in four environments, three cameras, the room and a net.
+    """Render one moment in four environments, three cameras, the room, overlay and net.
 
     Args:
-        folder: where `environments.jpg`, `cameras.jpg`, `room.jpg` and `net.jpg` go.
+        folder: where `environments.jpg`, `cameras.jpg`, `room.jpg`,
+            `overlay.jpg` and `net.jpg` go.
         small: render few rays of small images.
     """
     width, height, spp = (240, 100, 1) if small else (480, 200, 16)
@@ -80,12 +82,18 @@ def draw_worlds(folder: Path, small: bool) -> None:
     named = [titled(*pair) for pair in zip(cut, views, strict=True)]
     write_jpeg(folder / "cameras.jpg", beside(named), 800)
 
-    world = _world(bundled("room.toml").read_text("utf-8"))
+    room = bundled("room.toml").read_text("utf-8")
+    world = _world(room.replace("spp = 4", f"spp = {4 * spp}"))
     [cube] = world.fields
     cube.set_parameter("texture", random_texture(cube, "blobs", 4))
     tiles = [titled(_seen(world, name, 0.4), name) for name in ("surrogate", "mitsuba")]
     write_jpeg(folder / "room.jpg", beside(tiles), 800)
-    write_jpeg(folder / "net.jpg", _net(cube, 30 if small else 60))
+
+    lower, upper, faces = box_pictures(cube)
+    pose = world.surrogate.objects[0].placed
+    box = AttackedBox("cube", "none", 64 * "0", lower, upper, pose, faces)
+    write_jpeg(folder / "overlay.jpg", _overlaid(world, box), 800)
+    write_jpeg(folder / "net.jpg", _net(box, 30 if small else 60))
 
 
 def _world(text: str) -> World:
@@ -105,11 +113,25 @@ def _seen(world: World, label: str, arc_m: float) -> Image.Image:
     return Image.fromarray(frame.image)
 
 
-def _net(cube: GridField, dpi: int) -> Image.Image:
-    """Draw the net on the page that `export print` writes for a run of this cube."""
-    lower, upper, faces = box_pictures(cube)
-    pose = Pose.identity()
-    box = AttackedBox("cube", "none", 64 * "0", lower, upper, pose, faces)
+def _overlaid(world: World, box: AttackedBox) -> Image.Image:
+    """Draw a frame with a green target beside the one that `car overlay` writes."""
+    environment = world.open("mitsuba", empty=True)
+    frame = environment.reset(world.route, world.route.pose_at(0.4), 0)
+    environment.close()
+    # Faces differ a little in their green, as they do in the light of a room.
+    green = {
+        face: np.full_like(image, (0, 150 + 8 * number, 60))
+        for number, (face, image) in enumerate(box.images.items())
+    }
+    target = Overlay(replace(box, images=green), environment.camera, keyed=False)
+    recorded = target.apply(frame.image, frame.camera_to_world)
+    written = Overlay(box, environment.camera).apply(recorded, frame.camera_to_world)
+    named = {"recorded, with a green target": recorded, "the box in its place": written}
+    return beside([titled(Image.fromarray(i), name) for name, i in named.items()])
+
+
+def _net(box: AttackedBox, dpi: int) -> Image.Image:
+    """Draw the net on the page that `export print` writes."""
     edges_mm = box.edges_mm(40)
     net = Net(edges_mm)
     with matplotlib.rc_context(RC):

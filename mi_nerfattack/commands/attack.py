@@ -117,7 +117,6 @@ class Attack:
     textures together cost as much as the attack. All drives are made in the surrogate
     and in the deployment environments that the scenario names. The run folder gets
     everything.
-    everything to a run folder.
     """
 
     continues: ClassVar[bool] = True

@@ -32,7 +32,7 @@ PLUGINS = {f"plugin_{name}.jpg" for name in NAMES}
 GALLERY = set(
     re.findall(r"\]\(pictures/(\w+\.jpg)\)", (DOCS / "gallery.md").read_text("utf-8"))
 )
-WORLDS = {"environments.jpg", "cameras.jpg", "room.jpg", "net.jpg"}
+WORLDS = {"environments.jpg", "cameras.jpg", "room.jpg", "overlay.jpg", "net.jpg"}
 
 
 def read(path: Path) -> np.ndarray:
