@@ -123,9 +123,10 @@ def _attack(
         return
     freedom = document["scenario"].get("attack", {}).get("freedom", {})
     random = f"random {_CHANGED[freedom.get('kind', 'texture')]}"
+    drawn = f"{cases[RANDOM]['n']} {random}"  # a drive each
     objective = document.get("objective")
     if objective is None:
-        beats, text = _by_error(document, name, cases, random)
+        beats, text = _by_error(document, name, cases, drawn)
     elif any(cases[case].get(_OBJECTIVE) is None for case in cases):
         why = objective["missing"].get(name, "a drive ended before the others")
         yield f"The objective has no value in {name}, which is not judged: {why}."
@@ -133,7 +134,7 @@ def _attack(
     elif OWN not in cases:
         return
     else:
-        beats, text = _by_objective(document, name, cases, random)
+        beats, text = _by_objective(document, name, cases, drawn)
     if is_surrogate:
         lead = "beats" if beats else "does not beat"
         yield f"The attack {lead} {random} in the surrogate: {text}."
@@ -145,13 +146,13 @@ def _attack(
 
 
 def _by_error(
-    document: Figures, name: str, cases: Figures, random: str
+    document: Figures, name: str, cases: Figures, drawn: str
 ) -> tuple[bool, str]:
     """Judge an attack by the mean distance from the lane centre."""
     mean = cases[ATTACK][_ERROR]
     ratio = _ratio(mean, cases[RANDOM][_ERROR])
     effect = _by_starts(document, name, (ATTACK, RANDOM), _ERROR)
-    text = f"a mean error of {mean:.3f} m, {ratio:.1f} times that of {random}"
+    text = f"a mean error of {mean:.3f} m, {ratio:.1f} times that of {drawn}"
     text += _interval(effect.ratio_ci95, effect.attacks, ".1f")
     if BEST_RANDOM in cases:
         best = _ratio(mean, cases[BEST_RANDOM][_ERROR])
@@ -160,7 +161,7 @@ def _by_error(
 
 
 def _by_objective(
-    document: Figures, name: str, cases: Figures, random: str
+    document: Figures, name: str, cases: Figures, drawn: str
 ) -> tuple[bool, str]:
     """Judge an attack by its own objective, see :func:`verdict`."""
     gains = {
@@ -182,7 +183,7 @@ def _by_objective(
         added = values[OWN] - values[NO_OBJECT]
         if 0 < gain <= 2 * added:  # else a share says nothing
             text += f", so that the attack removes {gain / added:.0%} of what they add"
-    text += f"; {random} gain {chance:.3g} in the mean"
+    text += f"; {drawn} gain {chance:.3g} in the mean"
     beats = gain > 0 and gain >= BEATS * chance
     if BEST_RANDOM in gains:
         best = gains[BEST_RANDOM].difference

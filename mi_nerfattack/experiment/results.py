@@ -15,6 +15,7 @@ from mi_nerfattack.evaluation.metrics import metrics_document, validate
 from mi_nerfattack.evaluation.verdict import run_flags, verdict
 from mi_nerfattack.experiment.attribution import control_changes, write_control_changes
 from mi_nerfattack.experiment.cases import OnProgress
+from mi_nerfattack.experiment.checks.before_attack import fit_findings
 from mi_nerfattack.experiment.finished import Finished, Frames
 from mi_nerfattack.experiment.page.run import read_run
 from mi_nerfattack.experiment.pictures.write import write_images
@@ -165,6 +166,7 @@ def _describe(done: Finished, effort: Callable[[], Effort]) -> dict[str, Any]:
     without = [names[index] for index in attack.without_gradient]
     document["flags"] = [
         *done.flags,
+        *fit_findings(world),
         *run_flags(document, without, attack.sweeps > 1),
     ]
     document["verdict"] = verdict(document, SURROGATE)

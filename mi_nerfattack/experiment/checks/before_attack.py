@@ -25,6 +25,7 @@ from mi_nerfattack.render.pathtrace.ground import (
 )
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.report.pages.verdict import fit_doubts
 from mi_nerfattack.rollout.drive import OWN, Drive, departure_limit
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import World
@@ -46,15 +47,27 @@ def driven_arc(world: World) -> np.ndarray:
     return arc_lengths(*scenario.drive.stretch(world.route, scenario.vehicle.dt_s))
 
 
-def box_findings(world: World) -> Iterator[str]:
-    """Tell of a route that leaves the box of the surrogate's field."""
-    arc = driven_arc(world)
-    points = world.route.pose_at(arc)[:, :2]
+def scene_field(world: World) -> PosedField | None:
+    """Return the field of the scene; None where it has another surrogate."""
     objects = world.surrogate.objects
     layers = [item for item in world.surrogate.layers if item not in objects]
-    if len(layers) != 1 or not isinstance(layers[0], PosedField):
+    found = layers[0] if len(layers) == 1 else None
+    return found if isinstance(found, PosedField) else None
+
+
+def fit_findings(world: World) -> Iterator[str]:
+    """Doubt a field of the scene that was fitted too little."""
+    if (posed := scene_field(world)) is not None:
+        yield from fit_doubts(posed.field.info, str(world.scenario.scene.field))
+
+
+def box_findings(world: World) -> Iterator[str]:
+    """Tell of a route that leaves the box of the surrogate's field."""
+    if (posed := scene_field(world)) is None:
         return
-    field, pose = layers[0].field, layers[0].placed
+    arc = driven_arc(world)
+    points = world.route.pose_at(arc)[:, :2]
+    field, pose = posed.field, posed.placed
     inside = np.column_stack(
         [points, np.full(len(points), world.surrogate.mount.height_m)]
     )

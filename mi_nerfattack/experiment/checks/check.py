@@ -27,6 +27,7 @@ from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.experiment.checks.before_attack import (
     driven_arc,
     first_findings,
+    fit_findings,
     further_findings,
     likeness_findings,
     mesh_scene,
@@ -87,6 +88,7 @@ class Check:
             *unit_findings(world),
             *speed_findings(world),
             *period_findings(world),
+            *fit_findings(world),
         ]
         try:
             if drives:
