@@ -19,7 +19,7 @@ from mi_nerfattack.report.plots.charts import blank, png
 
 MARK = "<!-- python -m bench results --pages writes this page from the table. -->"
 FOLDER = ROOT / "docs/results/findings"
-_SIZE_IN, _DPI = (8.0, 3.4), 100
+_SIZE_IN, _DPI = (6.0, 3.4), 130
 
 
 def write_pages(
