@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -45,6 +45,7 @@ _OTHER_HEIGHT_SHARE, _PITCH_SD_DEG = 0.3, 6.0
 _HEIGHTS = 4 / 7, 15 / 7  # in heights of the camera: 0.8 to 3 m, of 1.4 m
 _FORMAT = "mi_nerfattack captured view 1"
 _IDENTITY = "capture"  # key of transforms.json
+_DEPTH = "depth.safetensors"
 _VIEWS = "views"  # folder of views until all are there
 _REMEDY = "choose another folder, or remove this one"
 _ROUNDS = 20  # of draws in place of views from within things
@@ -86,6 +87,7 @@ def drive_poses(
         raise InputError(f"seed: {seed}; at least 0")
     mount = CameraMount() if mount is None else mount
     rng = np.random.default_rng(seed)
+    # Along the lane and across it, in shares of the route's length and lane widths
     along = rng.uniform(0, 1, n)
     cut = 0.5 / _LATERAL_SD
     lateral = _LATERAL_SD * np.asarray(
@@ -94,26 +96,41 @@ def drive_poses(
     beside = rng.uniform(size=n) < _BESIDE_SHARE
     reach = 0.5 + _BEYOND
     lateral = np.where(beside, rng.uniform(-reach, reach, n), lateral)
+    # Where the car heads, from the route's heading
     any_heading = rng.uniform(size=n) < _ANY_HEADING_SHARE
     heading = np.where(
         any_heading,
         rng.uniform(-np.pi, np.pi, n),
         rng.normal(0, np.radians(_HEADING_SD_DEG), n),
     )
+    # How the camera is mounted: as given, or higher, lower and pitched
     is_other = rng.uniform(size=n) < _OTHER_HEIGHT_SHARE
     low, high = (factor * mount.height_m for factor in _HEIGHTS)
     height = np.where(is_other, rng.uniform(low, high, n), mount.height_m)
     pitch = mount.pitch_deg + is_other * rng.normal(0, _PITCH_SD_DEG, n)
     poses = []
     for i in range(n):
-        route = routes[i % len(routes)]
-        width = route.lane_width_m
-        margin = 0.0 if route.closed else _BEYOND * width
-        arc = along[i] * (route.length + 2 * margin) - margin
-        state = route.pose_at(arc, lateral[i] * width, heading[i])
+        state = _scattered(routes[i % len(routes)], along[i], lateral[i], heading[i])
         here = replace(mount, height_m=float(height[i]), pitch_deg=float(pitch[i]))
         poses.append(mount_matrix(state, here)[0])
     return np.stack(poses)
+
+
+def _scattered(
+    route: Route, along: float, lateral: float, heading: float
+) -> np.ndarray:
+    """Return x, y and heading beside a route, from beyond its start to its end.
+
+    Args:
+        route: of the lane.
+        along: share of the length, beyond the ends included.
+        lateral: offset to the left, widths of the lane.
+        heading: from that of the route, radians.
+    """
+    width = route.lane_width_m
+    margin = 0.0 if route.closed else _BEYOND * width
+    arc = along * (route.length + 2 * margin) - margin
+    return route.pose_at(arc, lateral * width, heading)
 
 
 def _free_poses(
@@ -186,13 +203,9 @@ def capture_scene(
     require_colour()
     routes = load_routes(routes_path)
     mount = CameraMount() if mount is None else mount
-    choices = {
-        "camera": to_colmap(camera)[1],
-        "mount": mount.described(),
-        "views": n,
-        "spp": spp,
-        "seed": seed,
-    }
+    drawn = {"spp": spp, "seed": seed}
+    choices = {"camera": to_colmap(camera)[1], "mount": mount.described(), "views": n}
+    choices |= drawn
     identity = _identity(choices, Path(scene_path), Path(routes_path))
     root, path = Path(out_folder), Path(out_folder) / FILE_NAMES[0]
     if path.exists():
@@ -201,41 +214,49 @@ def capture_scene(
         progress(n, n)
         return path
     scene = load_scene(scene_path)
-    if scene.integrator() is None:
-        raise InputError(f"{scene_path}: has no integrator; add one, for instance path")
-    _check_ground(scene, Path(scene_path).name, routes, routes_path)
+    _check(scene, Path(scene_path), routes, routes_path)
     poses = _free_poses(scene, routes, n, seed, mount)
     begin_posed(out_folder)
+    renderer = ViewRenderer(scene, camera)
+    names = _write_views(root, renderer, poses, spp, seed, identity, progress)
+    extra = {"units": "metre", "depth_file": _DEPTH, **drawn, _IDENTITY: identity}
+    write_poses(path, names, camera, poses, extra)
+    shutil.rmtree(root / _VIEWS, ignore_errors=True)
+    return path
+
+
+def _write_views(
+    root: Path,
+    renderer: ViewRenderer,
+    poses: np.ndarray,
+    spp: int,
+    seed: int,
+    identity: Mapping[str, str],
+    progress: Callable[[int, int], None],
+) -> list[str]:
+    """Write images and depth, each view once it is kept; return the images' names."""
+    n, camera = len(poses), renderer.camera
     names = [f"images/{i:04d}.png" for i in range(n)]
     depth = np.empty((n, camera.height, camera.width), np.float32)
-    renderer, kept = ViewRenderer(scene, camera), files.make_folder(root / _VIEWS)
+    kept = files.make_folder(root / _VIEWS)
     for i, view_seed in enumerate(view_seeds(seed, n)):
         file = kept / f"{i:04d}.safetensors"
         unit = Unit(file, {**identity, "view": str(i)}, Record, _REMEDY)
         image, depth[i] = _view(unit, renderer, poses[i], spp, view_seed)
         files.write_image(root / names[i], image)
         progress(i + 1, n)
-    files.write_safetensors(root / "depth.safetensors", {"depth": depth})
-    extra = {
-        "units": "metre",
-        "depth_file": "depth.safetensors",
-        "spp": spp,
-        "seed": seed,
-        _IDENTITY: identity,
-    }
-    write_poses(path, names, camera, poses, extra)
-    shutil.rmtree(kept, ignore_errors=True)
-    return path
+    files.write_safetensors(root / _DEPTH, {"depth": depth})
+    return names
 
 
-def _check_ground(
-    scene: Any, name: str, routes: Sequence[Route], source: str | Path
-) -> None:
-    """Refuse routes without ground, or with a surface across them."""
+def _check(scene: Any, path: Path, routes: Sequence[Route], source: str | Path) -> None:
+    """Refuse no integrator, and routes without ground or with a surface across."""
+    if scene.integrator() is None:
+        raise InputError(f"{path}: has no integrator; add one, for instance path")
     for route in routes:
         arc = arc_lengths(0.0, route.length)
         for findings in (ground_findings, wall_findings):
-            for line in findings(route, arc, scene, name):
+            for line in findings(route, arc, scene, path.name):
                 raise InputError(f"{source}: {line}; no view was rendered")
 
 

@@ -105,25 +105,11 @@ def read_transforms(
     """
     source = find_transforms(Path(path))
     table, frames = read_table(source)
-    found: list[tuple[int, Path]] = []
-    missing: list[str] = []
-    for i, frame in enumerate(frames):
-        image = _find_image(source, i, frame)
-        if image is None:
-            missing.append(frame["file_path"])
-        else:
-            found.append((i, image))
-    if missing and (not skip_missing or not found):
-        raise InputError(
-            f"{source}: {len(missing)} of {len(frames)} frames have no image, first "
-            f"{missing[0]!r}; restore the files or leave these frames out "
-            "(--skip-missing, or skip_missing=True)"
-        )
-    used = {i: frames[i] for i, _ in found}
+    found, missing = _find_images(source, frames, skip_missing)
+    used, paths = {i: frames[i] for i in found}, list(found.values())
     poses = read_frames(source, used)
-    first = files.read_image(found[0][1])
+    first = files.read_image(paths[0])
     cameras = read_cameras(source, table, used, first.shape)
-    paths = [image for _, image in found]
     images, reduced = load_images(paths, cameras, source, long_edge_px)
     masks = load_masks(
         [
@@ -147,6 +133,27 @@ def read_transforms(
         str(table.get("units", "unknown")),
         masks,
     )
+
+
+def _find_images(
+    source: Path, frames: Sequence[Mapping[str, Any]], skip_missing: bool
+) -> tuple[dict[int, Path], list[str]]:
+    """Return image files by their frames, and the names of those that are missing."""
+    found: dict[int, Path] = {}
+    missing: list[str] = []
+    for i, frame in enumerate(frames):
+        image = _find_image(source, i, frame)
+        if image is None:
+            missing.append(frame["file_path"])
+        else:
+            found[i] = image
+    if missing and (not skip_missing or not found):
+        raise InputError(
+            f"{source}: {len(missing)} of {len(frames)} frames have no image, first "
+            f"{missing[0]!r}; restore the files or leave these frames out "
+            "(--skip-missing, or skip_missing=True)"
+        )
+    return found, missing
 
 
 def named_path(source: Path, field: str, name: Any) -> Path:

@@ -115,13 +115,7 @@ def fit_tracked(found: Structure, tracked: Tracked) -> HandEye:
 
     Source: Park and Martin 1994, robot sensor calibration; with a scale.
     """
-    shared = [i for i, n in enumerate(found.names) if n in tracked.body_to_world]
-    if len(shared) < _LEAST:
-        raise InputError(
-            f"{tracked.where}: has poses of {len(shared)} of {len(found.names)} placed "
-            f"photographs, at least {_LEAST} are needed; see that names, or the clocks "
-            "of the video and the tracker, agree"
-        )
+    shared = _shared(found, tracked)
     body = np.stack([tracked.body_to_world[found.names[i]] for i in shared])
     camera = found.camera_to_world[shared]
     turned = Rotation.from_matrix(body[:, :3, :3])
@@ -158,6 +152,18 @@ def fit_tracked(found: Structure, tracked: Tracked) -> HandEye:
         float(np.degrees(angle)),
         len(shared),
     )
+
+
+def _shared(found: Structure, tracked: Tracked) -> list[int]:
+    """Return the indices of the photographs that have both poses."""
+    shared = [i for i, n in enumerate(found.names) if n in tracked.body_to_world]
+    if len(shared) < _LEAST:
+        raise InputError(
+            f"{tracked.where}: has poses of {len(shared)} of {len(found.names)} placed "
+            f"photographs, at least {_LEAST} are needed; see that names, or the clocks "
+            "of the video and the tracker, agree"
+        )
+    return shared
 
 
 def _start(
