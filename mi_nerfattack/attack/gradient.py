@@ -285,12 +285,13 @@ class GradientAttack(AbstractAttack):
             for key, value in gradients.items()
         }
         share = self.plan.rate(self._objectives)
-        full = {key: self.freedom.texture_rate or 0.0 for key in values}
-        full[OFFSETS] = self.freedom.pose_rate or 0.0
-        self.optimiser.set_learning_rate({key: share * full[key] for key in values})
+        full = self.freedom.texture_rate or 0.0, self.freedom.pose_rate or 0.0
+        rates = {key: share * full[key == OFFSETS] for key in values}
+        self.optimiser.set_learning_rate(rates)
         for key, value in values.items():
             dr.set_grad(self.optimiser[key], _tensor(value / scale))
         self.optimiser.step()
+        # Back to the colours and poses that are allowed
         for key, value in self._colours().items():
             self.optimiser[key] = _tensor(self._colourings[key].project(value))
         if OFFSETS in values:
@@ -309,8 +310,7 @@ class GradientAttack(AbstractAttack):
             textures = self._textures(self._colours())
             self.sensor.set_textures([_tensor(texture) for texture in textures])
         if self.freedom.pose_rate is not None:
-            offsets = dr.detach(self.optimiser[OFFSETS])
-            move_all(self.sensor.objects, np.array(offsets, np.float64))
+            move_all(self.sensor.objects, self._value(OFFSETS).astype(np.float64))
 
     def _colours(self) -> Parameters:
         """Return what is stepped in, by the optimiser's key."""

@@ -135,6 +135,7 @@ class Checkpointed(AbstractAdjoint):
         starts = range(0, drive.horizon, self.segment)
         for start in reversed(starts):
             end = min(start + self.segment, drive.horizon)
+            # Forward through a segment: keep its frames, and drive the policy's memory
             memory, kept = drive.kept[start], []
             for index in range(start, end):
                 seen = drive.observe(sensor, index)
@@ -144,6 +145,7 @@ class Checkpointed(AbstractAdjoint):
                     numbers = loop.numbers(drive.states[index], index)
                     _, memory = loop.policy.step(image, loop.goal, memory, numbers)
                 del seen
+            # Back through the segment
             for index in reversed(range(start, end)):
                 view, memory = kept.pop()
                 seen = drive.restore(sensor, index, view)

@@ -339,14 +339,17 @@ def simulate(
     camera = camera_path or CameraPath(states)  # which grow as the vehicles drive
     still: Observation | None = None
     for index in range(horizon):
+        # The camera sees the scene, from the vehicle or from the path
         view, period = camera.at(index)
         seen = still or loop.sensor.observe(view, period)
         still = None if camera.frame is None else seen
         step = Step(index, states[-1], seen, memory)
+        # The policy steers by what it is shown
         image, numbers = loop.shown(seen, index), loop.numbers(states[-1], index)
         control, memory = loop.policy.step(image, loop.goal, memory, numbers)
         require_controls(control_size(control), loop.dynamics.control_names)
         controls.append(controls_as(dr.value_t(type(initial)), control))
+        # The vehicle moves by the control that acts now: with a delay, an earlier one
         acting = loop.transition.controls(controls, index, initial)
         states.append(loop.transition.advance(states[-1], *acting))
         dr.eval(controls[-1])
