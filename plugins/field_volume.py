@@ -194,6 +194,11 @@ class AbstractFieldVolume(mi.Volume):
                 "the box in which the volume was loaded; load the scene again, or use "
                 "field_integrator or field_emitter"
             )
+        if self.posed.has_pose_gradients:
+            raise InputError(
+                f"{self.id()}.to_world: has no derivative in a medium; use "
+                "field_integrator"
+            )
         point, _ = self.posed.to_local(it.p, mi.Vector3f(0, 0, 1))
         lower = mi.Point3f(*map(float, self.field.lower))
         upper = mi.Point3f(*map(float, self.field.upper))

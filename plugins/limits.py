@@ -144,10 +144,10 @@ def _shared(integrator: Any, scene: mi.Scene, attached: list[Any]) -> list[str]:
 
 
 def _check_behind(integrator: Any, key: str) -> None:
+    if integrator.relighting is not None:
+        raise InputError(_RELIT.format(key))
     if not differentiates_rays(integrator.behind):
         raise InputError(
             f"{key}: its effect through the nested {integrator.behind.class_name()} "
             'has no derivative; nest <integrator type="prb"/> in its place'
         )
-    if integrator.relighting is not None:
-        raise InputError(_RELIT.format(key))

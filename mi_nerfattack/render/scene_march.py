@@ -38,10 +38,16 @@ def nearest_surface(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Float
                 f"{shape.id()}: ellipsoids among the scene's shapes would hide the "
                 "fields; nest a splat_background in field_integrator instead"
             )
-    if any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null) for shape in shapes):
+    if has_passages(scene):
         return _walk_through(scene, ray, active)
     hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     return dr.select(hit.is_valid(), hit.t, dr.inf)
+
+
+def has_passages(scene: mi.Scene) -> bool:
+    """Tell whether light passes a surface of a scene straight."""
+    null = mi.BSDFFlags.Null
+    return any(mi.has_flag(shape.bsdf().flags(), null) for shape in scene.shapes())
 
 
 @dr.syntax

@@ -18,7 +18,9 @@ import pytest
 from support.reference.derivatives import RGB, SPECTRAL, later
 from support.worlds import fields as small
 
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, GridLayout, load_field, save_field
+from mi_nerfattack.scenes import bundled
 
 TEXELS = 80
 CENTRES = np.linspace(-1, 1, TEXELS)
@@ -122,6 +124,27 @@ def gradients(loaded: mi.Scene, suffixes: tuple[str, ...]) -> list[np.ndarray]:
     weight = np.random.default_rng(3).normal(size=image.shape).astype(np.float32)
     dr.backward(dr.sum(image * mi.TensorXf(weight)))
     return [dr.grad(params[key]).numpy().astype(float) for key in keys]
+
+
+@pytest.mark.parametrize("each_variant", RGB, indirect=True)
+@pytest.mark.parametrize("shift", [0.0, 1.0])
+def test_a_medium_does_not_move(each_variant: str, shift: float) -> None:
+    """A new pose and a derivative by the pose are refused, and not 0."""
+    path = bundled("hydrant/field.safetensors")
+    loaded = scene(own(path), own(path, "radiance"), "prbvolpath")
+    params = mi.traverse(loaded)
+    (key,) = (name for name in params.keys() if name.endswith("sigma_t.to_world"))
+    x = mi.Float(shift)
+    dr.enable_grad(x)
+    params[key] = mi.AffineTransform4f().translate([x, 0, 0]) @ params[key]
+    params.update()
+    with pytest.raises(RuntimeError) as refused:
+        dr.backward(dr.mean(mi.render(loaded, params, spp=1)))
+    why = refused.value
+    while why.__cause__ is not None:  # Mitsuba and Dr.Jit wrap it
+        why = why.__cause__
+    assert isinstance(why, InputError)
+    assert ("cannot follow to_world" if shift else "no derivative") in str(why)
 
 
 @pytest.mark.parametrize("each_variant", [*RGB, *later(*SPECTRAL)], indirect=True)

@@ -39,6 +39,7 @@ from mi_nerfattack.render.lighting.surface import Surface, expected_surface, geo
 from mi_nerfattack.render.march import STOP, march
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import Rays
+from mi_nerfattack.render.scene_march import has_passages, nearest_surface
 
 LIGHT_SAMPLES = 16
 CLEARANCE = 2.0  # marching steps between a surface and where its shadow rays start
@@ -106,6 +107,9 @@ class Relighting:
         pairs = zip(posed, self.relit, strict=True)
         objects = [geometry(item) for item, relit in pairs if relit]
         with dr.suspend_grad():
+            if has_passages(scene):  # from just before the surface that stops the ray
+                met = nearest_surface(scene, ray, active)
+                ray = mi.Ray3f(ray(dr.select(dr.isinf(met), 0, (1 - 1e-4) * met)), ray.d)
             si = scene.ray_intersect(ray, active)
             facing = dr.dot(si.n, ray.d) < 0
             normal = dr.select(facing, mi.Vector3f(si.n), -mi.Vector3f(si.n))
@@ -129,6 +133,7 @@ class Relighting:
         active = mi.Bool(surface.active)
         # A lattice under a random shift: evenly spread, each point uniform by itself.
         shift, turn = sampler.next_2d(active), sampler.next_1d(active)
+        walks = has_passages(scene)
         k = mi.UInt32(0)
         lit = mi.Color3f(0)
         unshadowed = mi.Color3f(0)
@@ -138,12 +143,14 @@ class Relighting:
             sample -= dr.floor(sample)
             wavelengths, weight = _wavelengths(turn + i * _SILVER)
             it.wavelengths = wavelengths
-            ds, light = scene.sample_emitter_direction(it, sample, True, active)
+            ds, light = scene.sample_emitter_direction(it, sample, not walks, active)
             cosine = dr.maximum(dr.dot(surface.normal, ds.d), 0)
             light = _to_rgb(light * weight, wavelengths) * (cosine / self.samples)
             is_far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
             end = dr.select(is_far, dr.inf, ds.dist)
             used = active & (dr.max(dr.abs(light)) > 0)
+            if walks:  # Mitsuba's shadow rays end at what light passes straight
+                used &= dr.isinf(nearest_surface(scene, it.spawn_ray_to(ds.p), used))
             passed = _transmittance(
                 objects, Rays(it.p, ds.d, end, mi.Float(0.5), used), self.stop
             )

@@ -95,6 +95,23 @@ def test_walls_and_other_objects_block_the_sun(box) -> None:
     assert colour(shaded).max() < 1e-6
 
 
+def test_light_passes_what_lets_it_through(box) -> None:
+    """Object and shadow are those of a scene without the shells around them."""
+    floor = {"type": "rectangle", "to_world": T().translate([0, 0, -1]).scale(9)}
+    lamps = {"light": sun(-1, 0, -1), "floor": floor}
+    inner = {"type": "sphere", "radius": 4.0, "bsdf": {"type": "null"}}
+    seen = []
+    for shells in ({}, {"inner": inner, "outer": {**inner, "radius": 30.0}}):
+        behind = {"type": "volpath", "max_depth": 2}
+        loaded = scene(
+            {"object": box, "behind": behind}, (-2, 4, 9), 35, **lamps, **shells
+        )
+        seen.append(np.array(mi.render(loaded, spp=64))[..., :3])
+    bare, inside = seen
+    assert bare.min() < 0.01 < 0.1 < np.median(bare)  # a shadow on the bright floor
+    np.testing.assert_allclose(inside, bare, rtol=0.03, atol=0.003)
+
+
 def test_a_point_light_falls_off_with_its_distance(box) -> None:
     intensity = {"type": "rgb", "value": 8.0}
     lamp = {"type": "point", "position": [9.0, 0.0, 0.0], "intensity": intensity}
