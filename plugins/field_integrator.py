@@ -96,13 +96,14 @@ class FieldIntegrator(FilmIntegrator):
     expected depth, ``I = I_f + (1 - a_f) I_b``, A.4 to A.6); they agree where fields do
     not overlap. A ``splat_background`` is a layer of ``depth`` alone.
 
-    With ``aovs``, the image has more channels: ``opacity`` and ``depth`` (metres) of
-    the composite. Each field adds ``<id>.R``, ``<id>.G``, ``<id>.B`` (premultiplied),
-    ``<id>.A`` and ``<id>.Z``: of the field's share of the image (``interleaved``) or
-    of the field alone (``depth``). The depth of a pixel is the mean of its samples
-    weighted by their opacity, infinite where none is above 0. The film itself holds
-    ``moment`` and ``<id>.moment``, depth times opacity, in the place of depths. AOVs of
-    the nested integrator come last. The film's alpha is the opacity, over that of the
+    With ``aovs``, the image has more channels, which ``aov_names()`` lists: ``opacity``
+    and ``depth`` (metres) of the composite of fields, without surfaces. Each field adds
+    ``<id>.R``, ``<id>.G``, ``<id>.B`` (premultiplied), ``<id>.A`` and ``<id>.Z``: of
+    the field's share of the image (``interleaved``) or of the field alone (``depth``).
+    The depth of a pixel is the mean of its samples weighted by their opacity, infinite
+    where none is above 0. The film itself holds ``moment`` and ``<id>.moment``, depth
+    times opacity, in the place of depths. AOVs of the nested integrator come last, for
+    example the depth of surfaces. The film's alpha is the opacity, over that of the
     nested integrator.
 
     .. tabs::
