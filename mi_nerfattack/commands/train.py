@@ -35,10 +35,8 @@ _REFUSED = {
 class Train:
     """Train a driving policy on frames of any environments of a place.
 
-    Collects frames, three quarters of them with 1 to 6 objects of random texture at the
-    roadside. Trains PilotNet to imitate the expert, lets it drive and trains it on the
-    frames that it saw (DAgger). Ends with its closed-loop error. Stopped, it continues
-    from DATA. Validation and program are written next to the policy.
+    Collects frames, most with objects of random texture. Trains PilotNet to imitate the
+    expert, also where it drives itself (DAgger). Continues from DATA.
     """
 
     continues: ClassVar[bool] = True
@@ -101,6 +99,8 @@ class Train:
     """Least and most factor to the size, as of evaluate."""
     facing: Facing = "shape"
     """What faces the traffic."""
+    waypoints_s: tuple[float, ...] = ()
+    """Times of the frames' waypoints; 0.5 1 1.5 2."""
     objects: tuple[int, ...] = (1,)
     """Numbers of objects in the last validation."""
     workers: int | None = None
@@ -287,6 +287,8 @@ class Train:
         roadside = replace(collecting.roadside, scales=scales, facing=self.facing)
         if self.most_objects == 0:
             collecting = replace(collecting, object_share=0.0)
+        if self.waypoints_s:
+            collecting = replace(collecting, waypoints_s=self.waypoints_s)
         most = self.most_objects or collecting.objects
         drives = replace(
             drives, runs=self.runs, objects=self.objects, roadside=roadside

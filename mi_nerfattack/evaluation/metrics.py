@@ -264,6 +264,7 @@ class _Cases(_Model):
 
 class _Baseline(_Model):
     textures: Count
+    equal_textures: Count | None = None  # unknown in runs of earlier versions
     deployment_textures: Count
     backward_multiple: NonNegative
     best: Whole

@@ -123,7 +123,11 @@ def _attack(
         return
     freedom = document["scenario"].get("attack", {}).get("freedom", {})
     random = f"random {_CHANGED[freedom.get('kind', 'texture')]}"
-    drawn = f"{cases[RANDOM]['n']} {random}"  # a drive each
+    count = cases[RANDOM]["n"]  # a drive each
+    drawn = f"{count} {random}"
+    equal = document.get("baseline", {}).get("equal_textures") or count
+    if is_surrogate and count < equal:
+        drawn = f"{count} of the {equal} {random} that its cost pays for"
     objective = document.get("objective")
     if objective is None:
         beats, text = _by_error(document, name, cases, drawn)

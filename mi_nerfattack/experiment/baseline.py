@@ -162,6 +162,7 @@ class Baseline:
         attack: finished.
         looks: draws.
         count: number of random appearances.
+        equal: number that costs as much as the attack.
         deployed: number of them that drive in each deployment.
         backward_multiple: cost of the attack's backward pass, in drives.
         objectives: of the random appearances, once they are judged.
@@ -170,6 +171,7 @@ class Baseline:
     attack: AbstractAttack
     looks: RandomAppearances
     count: int
+    equal: int
     deployed: int
     backward_multiple: float
     objectives: list[float] = field(default_factory=list)
@@ -196,10 +198,11 @@ class Baseline:
         is_timed = attack.sweeps > 1 and not strict
         multiple = effort.backward_multiple if is_timed else attack.sweeps - 1.0
         drives = attack.iteration * attack.rollout.frames / attack.rollout.horizon
-        count = section.textures or equal_count(drives, multiple)
+        equal = equal_count(drives, multiple)
+        count = section.textures or equal
         deployed = min(count, section.deployment_textures)
         looks = RandomAppearances.of(world, original)
-        return cls(attack, looks, count, deployed, multiple)
+        return cls(attack, looks, count, equal, deployed, multiple)
 
     def judge(
         self,
@@ -246,6 +249,7 @@ class Baseline:
         """Return what ``metrics.json`` holds of the baseline."""
         return {
             "textures": self.count,
+            "equal_textures": self.equal,
             "deployment_textures": self.deployed,
             "backward_multiple": self.backward_multiple,
             "best": self.best,

@@ -88,7 +88,8 @@ def columns_of(
             raise InputError(
                 f"{name}: controls {shape} for {count} images; the policy must return "
                 "one number for each image, (n,) or (n, 1), or several, (n, k), and "
-                f"policy.output (is {output}) must tell the column of the control"
+                f"policy.output (is {output}) must tell the column of the control; "
+                "for waypoints, write [policy.trajectory]"
             )
         columns = list(column) if isinstance(column, Sequence) else column
         values = values[:, columns]

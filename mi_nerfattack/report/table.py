@@ -224,8 +224,8 @@ def transfer_table(document: Document) -> Table:
     caption = (
         "Over attacks, each of which counts once: mean error and its 95 % interval, "
         "the mean error as a multiple of that in the surrogate (geometric mean), "
-        "attacks with a wheel out, and of those that succeed in the surrogate how many "
-        "do here, with Wilson's intervals."
+        "attacks with a wheel out for 1 s (a mean over drives), and of those that "
+        "succeed in the surrogate how many do here, with Wilson's intervals."
     )
     rows = [column | column["cases"] for column in document["columns"]]
     labels = [_ENVIRONMENT, Column("condition", "condition")]

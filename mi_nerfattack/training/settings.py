@@ -64,7 +64,7 @@ class CollectSettings:
         times = self.waypoints_s
         if not times or list(times) != sorted(set(times)):
             raise InputError(
-                f"CollectSettings.waypoints_s: {times}; at least one time, ascending"
+                f"waypoints_s: {list(times)}; at least one time, ascending"
             )
 
     @property

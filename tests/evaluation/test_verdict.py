@@ -75,6 +75,16 @@ def test_each_sentence_says_what_the_figures_say(judged):
         assert all(word in sentence for word in words), sentence
 
 
+def test_fewer_random_textures_than_the_attack_pays_for_are_told(judged):
+    for equal, words in (
+        (5, "times that of 5 random textures"),
+        (12, "times that of 5 of the 12 random textures that its cost pays for"),
+    ):
+        judged["baseline"] = {"equal_textures": equal}
+        _, _, attack, transfer, *_ = verdict(judged, "surrogate")
+        assert words in attack and "times that of 5 random textures" in transfer
+
+
 def test_the_interval_is_that_of_equal_starts(judged):
     """The attack is strong from one start alone, so that its ratio is uncertain."""
     cases = judged["routes"]["right"]["surrogate"]

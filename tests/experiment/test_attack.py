@@ -103,6 +103,7 @@ def assert_counts(document):
     multiple = cost["backward_s"] / cost["forward_s"]
     assert baseline["backward_multiple"] == pytest.approx(multiple)
     assert count == round(3 * (1 + multiple)) == len(baseline["objectives"])
+    assert baseline["equal_textures"] == count
     assert few == min(count, 8)
     for environment, drawn in (("surrogate", count), ("mitsuba", few)):
         counts = {case: drawn if case == "random" else 2 for case in CASES}

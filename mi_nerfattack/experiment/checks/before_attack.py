@@ -25,7 +25,7 @@ from mi_nerfattack.render.pathtrace.ground import (
 )
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.report.pages.verdict import fit_doubts
+from mi_nerfattack.report.pages.verdict import MIN_PSNR_DB
 from mi_nerfattack.rollout.drive import OWN, Drive, departure_limit
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import World
@@ -56,9 +56,20 @@ def scene_field(world: World) -> PosedField | None:
 
 
 def fit_findings(world: World) -> Iterator[str]:
-    """Doubt a field of the scene that was fitted too little."""
-    if (posed := scene_field(world)) is not None:
-        yield from fit_doubts(posed.field.info, str(world.scenario.scene.field))
+    """Doubt a field of the scene whose fit, says its file, was not good enough.
+
+    Fields of other programs have no figures of a fit.
+    """
+    if (posed := scene_field(world)) is None:
+        return
+    psnr_db = float(posed.field.info.get("fit.psnr_heldout_db", "nan"))
+    if psnr_db < MIN_PSNR_DB:
+        yield (
+            f"blurred field: {world.scenario.scene.field} shows its held-out views "
+            f"with {psnr_db:.1f} dB on average, and {MIN_PSNR_DB:g} dB are good enough "
+            "to test a policy in; an attack may exploit errors of the field; fit for "
+            "longer, or to more views"
+        )
 
 
 def box_findings(world: World) -> Iterator[str]:
@@ -182,7 +193,9 @@ def departure_findings(world: World, drives: list[Drive]) -> Iterator[str]:
         f"{worst.environment}, run {runs}, objects in their own textures, it comes to "
         f"{worst.distance_m.max():.2f} m from the lane's centre, and beyond "
         f"{limit:.2f} m after {worst.time_s[step]:.1f} s at ({x:.1f}, {y:.1f}) m; give "
-        "a policy that keeps it, or another route, start or object"
+        "a policy that keeps it, or another route, start or object; if it keeps its "
+        "lane elsewhere, compare the order of its goals, policy.preprocess, the camera "
+        "and the sign of its control with its training"
     )
 
 

@@ -109,7 +109,9 @@ class Relighting:
         with dr.suspend_grad():
             if has_passages(scene):  # from just before the surface that stops the ray
                 met = nearest_surface(scene, ray, active)
-                ray = mi.Ray3f(ray(dr.select(dr.isinf(met), 0, (1 - 1e-4) * met)), ray.d)
+                ray = mi.Ray3f(
+                    ray(dr.select(dr.isinf(met), 0, (1 - 1e-4) * met)), ray.d
+                )
             si = scene.ray_intersect(ray, active)
             facing = dr.dot(si.n, ray.d) < 0
             normal = dr.select(facing, mi.Vector3f(si.n), -mi.Vector3f(si.n))

@@ -6,7 +6,7 @@ criteria are the same, and the frames decide, because a policy sees them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -187,19 +187,3 @@ def verdict(criteria: Sequence[Criterion]) -> str:
     names = "; ".join(item.name for item in failed)
     advice = " ".join(dict.fromkeys(item.advice for item in failed))
     return f"Not good enough {subject.use}: {names}. {advice}"
-
-
-def fit_doubts(info: Mapping[str, str], file: str) -> Iterator[str]:
-    """Doubt the field of a scene whose file says that its fit was not good enough.
-
-    Args:
-        info: metadata of the file; fields of other programs have no figures of a fit.
-        file: its name, for the message.
-    """
-    psnr_db = float(info.get("fit.psnr_heldout_db", "nan"))
-    if psnr_db < MIN_PSNR_DB:
-        yield (
-            f"blurred field: {file} shows its held-out views with {psnr_db:.1f} dB on "
-            f"average, and {MIN_PSNR_DB:g} dB are good enough {SCENE.use}; an attack "
-            "may exploit errors of the field; fit for longer, or to more views"
-        )
