@@ -11,8 +11,9 @@ import numpy as np
 
 from mi_nerfattack.attack.texture.statistics import seen_weights, texture_statistics
 from mi_nerfattack.drives.table import write_steps
+from mi_nerfattack.evaluation.flags import run_flags
 from mi_nerfattack.evaluation.metrics import metrics_document, validate
-from mi_nerfattack.evaluation.verdict import run_flags, verdict
+from mi_nerfattack.evaluation.verdict import verdict
 from mi_nerfattack.experiment.attribution import control_changes, write_control_changes
 from mi_nerfattack.experiment.cases import OnProgress
 from mi_nerfattack.experiment.checks.before_attack import fit_findings

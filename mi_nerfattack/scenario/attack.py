@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
@@ -94,10 +95,13 @@ class AbstractGradientMethod(AbstractMethod):
         if self.opening != "none" and not (
             self._each >= FEWEST and self._each * self._tries < count
         ):
+            tried = FEWEST * self._tries
+            least = max(math.ceil(tried / self.opening_share), tried + 1)
             refuse(
                 "opening_share",
                 f"{self.opening_share:g} of {count} iterations for {self._tries} "
-                f"tries; each try takes at least {FEWEST}, and one is left over",
+                f"tries; each try takes at least {FEWEST}, and one is left over; give "
+                f"max_iterations = {least} or more, or another share",
             )
         return self
 

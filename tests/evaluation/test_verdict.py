@@ -9,13 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from mi_nerfattack.attack import plan
+from mi_nerfattack.evaluation import flags
+from mi_nerfattack.evaluation.flags import black_box_better, noise_larger, run_flags
 from mi_nerfattack.evaluation.pairs import compare
-from mi_nerfattack.evaluation.verdict import (
-    black_box_better,
-    noise_larger,
-    run_flags,
-    verdict,
-)
+from mi_nerfattack.evaluation.verdict import verdict
 
 
 def case(means, departed: int = 0, largest: float = 0.2) -> dict[str, object]:
@@ -258,7 +256,37 @@ def test_an_attack_that_had_more_to_gain(document):
     check(document, "not converged")
     assert "%" not in next(run_flags(document, (), True))
     del document["curve"]  # of an attack that went on by force
-    check(document, "not converged")
+    check(document, "not converged", "still gaining, had gained nothing, or")
+
+
+@pytest.mark.parametrize(
+    ("objectives", "words"),
+    [
+        ([-1.0 * k for k in range(13)], "9 iterations at full rates, and 10"),  # of 12
+        ([-1.0 * k for k in range(14)], "it was still gaining;"),
+        ([-1.0] * 14, "it gained nothing;"),
+    ],
+)
+def test_why_an_attack_has_not_converged(document, objectives, words):
+    """Rates are full for three quarters of the iterations."""
+    document |= {"converged": False, "baseline": {"objectives": [0.0]}}
+    document["curve"] = curve([10 + 20 * k for k in range(len(objectives))], objectives)
+    check(document, "not converged", words)
+    assert flags.FEWEST == plan._FEWEST
+
+
+def test_random_textures_are_not_compared_with_the_tries_of_an_opening(document):
+    """A quarter of 16 iterations, of 20 frames each: the tries end with 90 frames."""
+    document["curve"] = curve([10 + 20 * k for k in range(17)], [-2.0] * 17)
+    method = {"opening": "sides", "opening_share": 0.25, "max_iterations": 16}
+    document["scenario"] = {"attack": {"method": method}}
+    document["baseline"]["objectives"] = [-9.0] * 9
+    check(document, "")
+    document["baseline"]["objectives"] = [-9.0] * 10
+    check(document, "black box better")
+    method["opening"] = "none"
+    document["baseline"]["objectives"] = [-9.0] * 9
+    check(document, "black box better")
 
 
 def test_textures_at_their_bounds_and_out_of_view(document):

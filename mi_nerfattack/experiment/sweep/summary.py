@@ -17,9 +17,9 @@ import pandas as pd
 
 from mi_nerfattack.drives.table import records, with_starts
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.evaluation.flags import black_box_better, noise_larger
 from mi_nerfattack.evaluation.pairs import Effect, compare, compare_departures
 from mi_nerfattack.evaluation.summary import DEPARTED_S, summary
-from mi_nerfattack.evaluation.verdict import black_box_better, noise_larger
 from mi_nerfattack.experiment.run_folder import METRICS
 from mi_nerfattack.experiment.sweep.cell import CELLS
 from mi_nerfattack.experiment.sweep.table import (
