@@ -37,6 +37,7 @@ class AbstractField(ABC):
         differentiable_by_position: whether density and radiance are continuous, so that
             derivatives by rays are those of the picture.
         has_sky: whether :meth:`background` is a picture, not black.
+        info: free metadata of its file (provenance, scores of its fit, units).
     """
 
     kind: str
@@ -48,6 +49,7 @@ class AbstractField(ABC):
     cone: float
     occupancy: Occupancy
     window: Window
+    info: dict[str, str]
     _live: list[Any]
 
     def __repr__(self) -> str:

@@ -90,12 +90,15 @@ def finish(
     page = write_fit_report(report_folder(output), result, images, title)
     checkpoint.unlink(missing_ok=True)  # before a closed pipe can end this
 
+    size = result.field.upper - result.field.lower
+
     def show() -> None:
         out = console()
         out.print(scores_table(result))
         out.print(
             f"{verdict(judge_fit(result))}\n{result.steps} steps in "
-            f"{result.wall_s:.0f} s. Wrote {output} and {page}.",
+            f"{result.wall_s:.0f} s. The field's box has {size[0]:.2f} x {size[1]:.2f} "
+            f"x {size[2]:.2f} m. Wrote {output} and {page}.",
             soft_wrap=True,
             highlight=False,
         )
