@@ -31,7 +31,7 @@ name = "test" -> attack.method.max_iterations = 0; name = "a" => :1: attack.meth
 [attack.method]; max_iteratons = 3 => :14: attack.method.max_iteratons: .*max_iterations
 [attack.method]; max_iterations = 0 => method.max_iterations: .*0
 [attack.method]; max_iterations = "3" => method.max_iterations: .*integer
-[attack.method]; opening = "sides"; max_iterations = 15 => opening_share: .*iterations = 16
+[attack.method]; opening = "sides"; max_iterations = 15 => opening_share: .* = 16 or
 [attack.method]; opening = "left" => method.opening: .*restarts
 [attack.method]; kind = "open_loop"; [attack]; attached = true => attached: .*open_l
 [attack.method]; follow = "in_turns" => attack.attached: .*in_turns
