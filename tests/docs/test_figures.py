@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
+from mi_nerfattack.experiment.sweep.table import read_table
 from mi_nerfattack.io import files
 
 ROOT = Path(__file__).parents[2]
@@ -99,6 +101,25 @@ def test_the_table_of_simulated_drives_equals_its_files(driver):
     assert (
         f"All {frames} frames, {row['commands']:,} commands and {poses} poses" in page
     )
+
+
+@pytest.mark.parametrize(("name", "pixels"), [("flat", "32"), ("flat_coarse", "8")])
+def test_patches_of_two_resolutions_equal_their_rows(name, pixels):
+    text = (ROOT / "docs/howto/flat_objects.md").read_text("utf-8")
+    shown = re.findall(r"^\| (\d) \| (\d+) \| ([\d.]+) \| ([\d.]+) \|$", text, re.M)
+    own = {int(row[0]): row[2:] for row in shown if row[1] == pixels}
+    rows = read_table(ROOT / "bench" / name / "results.csv")
+    rows = rows[(rows["route"] == "straight") & (rows["objects"] == "patch")]
+    rows = rows[rows["seed"].isin(own)]
+    means = rows.groupby(["seed", "environment", "case"])["cross_track_mean_m"].mean()
+    assert len(own) >= 2
+    for seed, figures in own.items():
+        found = [means[seed, where, "attack"] for where in ("surrogate", "built_in")]
+        assert tuple(f"{mean:.3f}" for mean in found) == figures
+    if (
+        name == "flat_coarse"
+    ):  # "All drives ... left the lane, and no drive with random"
+        assert (rows["departed"] == (rows["case"] == "attack")).all()
 
 
 def test_the_table_of_fits_equals_its_file():
