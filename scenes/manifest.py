@@ -28,8 +28,8 @@ BUDGET_MB = {
     "room/policy.safetensors": 6.5,
     "hydrant/field.safetensors": 2.5,
     "cube/field.safetensors": 4,
-    "other data": 3.3,
-    "code": 3.5,
+    "other data": 3.2,
+    "code": 3.6,
 }
 _KEYS = {"command", "seed", "sha256", "bytes", "machine", "note"}
 

@@ -15,9 +15,9 @@ from mi_nerfattack.drives.table import write_csv
 from mi_nerfattack.evaluation.summary import mean_interval
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.io import files
+from mi_nerfattack.report.plots.curves import TimeAttribution, plot_attribution
 from mi_nerfattack.report.plots.drives import control_change
 from mi_nerfattack.report.plots.heat import side_views, write_heat
-from mi_nerfattack.report.plots.time import TimeAttribution, plot_attribution
 from mi_nerfattack.rollout.drive import CASES, OWN, Drive
 from mi_nerfattack.rollout.loop import OnStep
 from mi_nerfattack.rollout.sweep import StepRecorder

@@ -20,12 +20,12 @@ from mi_nerfattack.experiment.attribution import (
 )
 from mi_nerfattack.io import files
 from mi_nerfattack.report.plots import heat
+from mi_nerfattack.report.plots.curves import TimeAttribution
 from mi_nerfattack.report.plots.heat import (
     SIDES,
     side_views,
     surface_heat,
 )
-from mi_nerfattack.report.plots.time import TimeAttribution
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.objective import StageSum
 

@@ -21,7 +21,7 @@ from mi_nerfattack.io import files
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.report.plots import strip
 from mi_nerfattack.report.plots.charts import VARIABLE
-from mi_nerfattack.report.plots.convergence import convergence
+from mi_nerfattack.report.plots.curves import convergence
 from mi_nerfattack.report.plots.drives import by_name, errors
 from mi_nerfattack.report.plots.map import overhead
 from mi_nerfattack.report.plots.place import Overlay, car_outline, routes_picture

@@ -25,7 +25,7 @@ from mi_nerfattack.report.pages.elements import (
     TransferPart,
 )
 from mi_nerfattack.report.pages.results import write_results_page
-from mi_nerfattack.report.plots import convergence as plots
+from mi_nerfattack.report.plots import curves as plots
 from mi_nerfattack.rollout.drive import ATTACK
 
 _KINDS = (

@@ -28,7 +28,7 @@ from mi_nerfattack.io import files
 from mi_nerfattack.io.video import write_video
 from mi_nerfattack.render.camera.outside import Overhead
 from mi_nerfattack.render.posed import object_footprints
-from mi_nerfattack.report.plots.convergence import convergence
+from mi_nerfattack.report.plots.curves import convergence
 from mi_nerfattack.report.plots.drives import by_name, errors
 from mi_nerfattack.report.plots.map import Panel, overhead, write_maps
 from mi_nerfattack.report.plots.strip import tiles
