@@ -77,8 +77,6 @@ def drive_poses(
     Returns:
         camera_to_world: (n, 4, 4), OpenCV axes.
     """
-    from scipy.stats import truncnorm
-
     if not routes or n < 1:
         raise InputError(
             f"drive_poses: {len(routes)} routes, n {n}; at least 1 of both"
@@ -89,13 +87,7 @@ def drive_poses(
     rng = np.random.default_rng(seed)
     # Along the lane and across it, in shares of the route's length and lane widths
     along = rng.uniform(0, 1, n)
-    cut = 0.5 / _LATERAL_SD
-    lateral = _LATERAL_SD * np.asarray(
-        truncnorm.rvs(-cut, cut, size=n, random_state=rng)
-    )
-    beside = rng.uniform(size=n) < _BESIDE_SHARE
-    reach = 0.5 + _BEYOND
-    lateral = np.where(beside, rng.uniform(-reach, reach, n), lateral)
+    lateral = _lateral(rng, n)
     # Where the car heads, from the route's heading
     any_heading = rng.uniform(size=n) < _ANY_HEADING_SHARE
     heading = np.where(
@@ -114,6 +106,18 @@ def drive_poses(
         here = replace(mount, height_m=float(height[i]), pitch_deg=float(pitch[i]))
         poses.append(mount_matrix(state, here)[0])
     return np.stack(poses)
+
+
+def _lateral(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Draw offsets (n,) to the left of the lane's centre, widths of the lane."""
+    from scipy.stats import truncnorm
+
+    cut = 0.5 / _LATERAL_SD
+    inside = truncnorm.rvs(-cut, cut, size=n, random_state=rng)
+    beside = rng.uniform(size=n) < _BESIDE_SHARE
+    reach = 0.5 + _BEYOND
+    anywhere = rng.uniform(-reach, reach, n)
+    return np.where(beside, anywhere, _LATERAL_SD * np.asarray(inside))
 
 
 def _scattered(
@@ -205,8 +209,7 @@ def capture_scene(
     mount = CameraMount() if mount is None else mount
     drawn = {"spp": spp, "seed": seed}
     choices = {"camera": to_colmap(camera)[1], "mount": mount.described(), "views": n}
-    choices |= drawn
-    identity = _identity(choices, Path(scene_path), Path(routes_path))
+    identity = _identity(choices | drawn, Path(scene_path), Path(routes_path))
     root, path = Path(out_folder), Path(out_folder) / FILE_NAMES[0]
     if path.exists():
         refuse(path, differences(_made_of(path), identity), _REMEDY)
@@ -217,8 +220,7 @@ def capture_scene(
     _check(scene, Path(scene_path), routes, routes_path)
     poses = _free_poses(scene, routes, n, seed, mount)
     begin_posed(out_folder)
-    renderer = ViewRenderer(scene, camera)
-    names = _write_views(root, renderer, poses, spp, seed, identity, progress)
+    names = _write_views(root, scene, camera, poses, drawn, identity, progress)
     extra = {"units": "metre", "depth_file": _DEPTH, **drawn, _IDENTITY: identity}
     write_poses(path, names, camera, poses, extra)
     shutil.rmtree(root / _VIEWS, ignore_errors=True)
@@ -227,22 +229,22 @@ def capture_scene(
 
 def _write_views(
     root: Path,
-    renderer: ViewRenderer,
+    scene: Any,
+    camera: Camera,
     poses: np.ndarray,
-    spp: int,
-    seed: int,
+    drawn: Mapping[str, int],
     identity: Mapping[str, str],
     progress: Callable[[int, int], None],
 ) -> list[str]:
     """Write images and depth, each view once it is kept; return the images' names."""
-    n, camera = len(poses), renderer.camera
+    n, renderer = len(poses), ViewRenderer(scene, camera)
     names = [f"images/{i:04d}.png" for i in range(n)]
     depth = np.empty((n, camera.height, camera.width), np.float32)
     kept = files.make_folder(root / _VIEWS)
-    for i, view_seed in enumerate(view_seeds(seed, n)):
+    for i, view_seed in enumerate(view_seeds(drawn["seed"], n)):
         file = kept / f"{i:04d}.safetensors"
         unit = Unit(file, {**identity, "view": str(i)}, Record, _REMEDY)
-        image, depth[i] = _view(unit, renderer, poses[i], spp, view_seed)
+        image, depth[i] = _view(unit, renderer, poses[i], drawn["spp"], view_seed)
         files.write_image(root / names[i], image)
         progress(i + 1, n)
     files.write_safetensors(root / _DEPTH, {"depth": depth})

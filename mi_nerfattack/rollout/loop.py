@@ -327,13 +327,7 @@ def simulate(
         InputError: the policy fails or gives another number of controls than the
             vehicle takes, or an implicit step does not converge.
     """
-    if horizon < 1:
-        raise ValueError(f"horizon: {horizon}; at least 1")
-    if len(initial) != loop.dynamics.state_size:
-        raise ValueError(
-            f"states: {len(initial)} rows; {type(loop.dynamics).__name__} has "
-            f"{loop.dynamics.state_size}: make them by ClosedLoop.initial"
-        )
+    _check_drive(loop, initial, horizon)
     states, controls, kept = [initial], [], []
     memory = loop.policy.initial_memory(dr.width(initial))
     camera = camera_path or CameraPath(states)  # which grow as the vehicles drive
@@ -366,3 +360,14 @@ def simulate(
         still=still,
         rows=loop.dynamics.own_rows,
     )
+
+
+def _check_drive(loop: ClosedLoop, initial: Any, horizon: int) -> None:
+    """Raise ValueError for a horizon below 1, or states of the wrong size."""
+    if horizon < 1:
+        raise ValueError(f"horizon: {horizon}; at least 1")
+    if len(initial) != loop.dynamics.state_size:
+        raise ValueError(
+            f"states: {len(initial)} rows; {type(loop.dynamics).__name__} has "
+            f"{loop.dynamics.state_size}: make them by ClosedLoop.initial"
+        )

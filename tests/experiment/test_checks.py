@@ -22,12 +22,10 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment import job as module
 from mi_nerfattack.experiment.checks import standing
 from mi_nerfattack.experiment.checks.before_attack import (
-    fit_findings,
     likeness_findings,
 )
 from mi_nerfattack.experiment.checks.check import duration
 from mi_nerfattack.experiment.checks.cost import planned_periods
-from mi_nerfattack.fields import load_field, save_field
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov, mount_matrix
 from mi_nerfattack.render.camera.pose import Pose
@@ -38,7 +36,6 @@ from mi_nerfattack.render.pathtrace.ground import (
 )
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.scenario.scenario import DriveSection, load_scenario
-from mi_nerfattack.scenario.world import build_world
 from mi_nerfattack.vehicle.route.route import Route
 
 pytestmark = pytest.mark.usefixtures("variant", "no_results")
@@ -274,19 +271,6 @@ def test_anyway_goes_on_and_the_run_remembers(folder, tmp_path, monkeypatch):
     kept = {"checkpoint.safetensors", "metrics.json"}
     for path, raw in contents(output).items():
         assert path.name not in kept or raw == before[path]
-
-
-@pytest.mark.parametrize(
-    ("psnr", "doubted"), [("23.9", True), ("24.0", False), (None, False)]
-)
-def test_a_field_that_was_fitted_too_little_is_doubted(folder, tmp_path, psnr, doubted):
-    scene = load_field(folder / "scene.safetensors")
-    scene.info |= {"fit.psnr_heldout_db": psnr} if psnr else {}
-    save_field(tmp_path / "fitted.safetensors", scene)
-    change = [f"scene.field={tmp_path / 'fitted.safetensors'}"]
-    scenario, _ = load_scenario(folder / "scenario.toml", settings=change)
-    found = list(fit_findings(build_world(scenario, scenario.build_policy())))
-    assert [f"{psnr} dB on average" in line for line in found] == [True] * doubted
 
 
 def test_a_sound_scenario_has_no_flags(whole):

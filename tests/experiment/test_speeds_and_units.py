@@ -1,4 +1,4 @@
-"""What `check` finds of a vehicle: speeds that differ, units that nothing says."""
+"""What `check` doubts: a blurred field, speeds that differ, units that nothing says."""
 
 from __future__ import annotations
 
@@ -6,7 +6,12 @@ import re
 
 import pytest
 
-from mi_nerfattack.experiment.checks.before_attack import speed_findings, unit_findings
+from mi_nerfattack.experiment.checks.before_attack import (
+    fit_findings,
+    speed_findings,
+    unit_findings,
+)
+from mi_nerfattack.fields import load_field, save_field
 from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.scenario.world import build_world
 
@@ -81,3 +86,18 @@ def test_units_that_nothing_says(scenario_folder, keys, vehicle, named):
     found = list(unit_findings(build_world(scenario, scenario.build_policy())))
     keys = " and ".join(f"{name}.control_unit" for name in named)
     assert [line.partition(":")[0] for line in found] == [keys] * bool(named)
+
+
+@pytest.mark.parametrize(
+    ("psnr", "doubted"), [("23.9", True), ("24.0", False), (None, False)]
+)
+def test_a_field_that_was_fitted_too_little_is_doubted(
+    scenario_folder, tmp_path, psnr, doubted
+):
+    scene = load_field(scenario_folder / "scene.safetensors")
+    scene.info |= {"fit.psnr_heldout_db": psnr} if psnr else {}
+    save_field(tmp_path / "fitted.safetensors", scene)
+    change = [f"scene.field={tmp_path / 'fitted.safetensors'}"]
+    scenario, _ = load_scenario(scenario_folder / "scenario.toml", settings=change)
+    found = list(fit_findings(build_world(scenario, scenario.build_policy())))
+    assert [f"{psnr} dB on average" in line for line in found] == [True] * doubted
