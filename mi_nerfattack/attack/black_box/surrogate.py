@@ -133,6 +133,7 @@ class SurrogateSearch(AbstractAttack):
 
     def load_tensors(self, tensors: dict[str, np.ndarray]) -> None:
         """See ``AbstractAttack.load_tensors``."""
+        # The search replays its history; the records follow from what it judged
         self._attack.load_tensors(tensors)
         for judged in self._attack.history:
             self._add(judged)

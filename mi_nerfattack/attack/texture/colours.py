@@ -129,6 +129,7 @@ class Colours(AbstractColouring):
 
     def texture(self, value: np.ndarray) -> np.ndarray:
         """See :meth:`AbstractColouring.texture`."""
+        # Levels add up before the sigmoid, so one level can take the whole change
         raw = self._original.copy()
         raw[self.level.vertices] += _logit(value) - self._raw
         return raw
@@ -141,6 +142,7 @@ class Colours(AbstractColouring):
 
     def smoothed(self, gradient: np.ndarray) -> np.ndarray:
         """Filter along z, y and x, see :meth:`AbstractColouring.smoothed`."""
+        # The binomial filter is separable: one axis after the other
         cube = gradient.reshape((self.level.resolution,) * 3 + (3,))
         for _ in range(self.smoothing):
             for axis in range(3):

@@ -43,6 +43,7 @@ def jacobian(
         r2 = r2 + _TINY
         r = _library(x).sqrt(r2)
         bent, slope = bend(_arctan(r), k1, k2, p1, p2)
+        # Across the radius the picture stretches by the bend, along it by its slope
         across = bent / r
         along = slope / (1 + r2) - across
         xx, yy = across + along * x * x / r2, across + along * y * y / r2
@@ -67,6 +68,7 @@ def undistort(
     for _ in range(_NEWTON_STEPS):
         fx, fy = distort(x, y, k1, k2, p1, p2)
         xx, xy, yy, determinant = jacobian(x, y, k1, k2, p1, p2)
+        # Newton: the error times the inverse of the symmetric Jacobian
         ex, ey = fx - u, fy - v
         x = x - (yy * ex - xy * ey) / determinant
         y = y - (xx * ey - xy * ex) / determinant
@@ -116,6 +118,7 @@ def is_invertible(
         tolerance: of the positions.
     """
     with np.errstate(all="ignore"):
+        # There and back again; and no fold, where the map would turn around
         if len(lens) > 4:
             radius, fisheye = np.hypot(u, v), lens[:4]
             angle = unbend(radius, *fisheye)

@@ -43,6 +43,7 @@ class Overhead:
             margin_m: around the outermost points, metres.
             longest_px: of the longer edge.
         """
+        # Pixels are square; the shorter edge gets as many as it needs
         low, high = points.min(0) - margin_m, points.max(0) + margin_m
         edge = float((high - low).max()) / longest_px
         width, height = np.ceil((high - low) / edge - 1e-9).astype(int).tolist()
@@ -85,6 +86,7 @@ class Overhead:
     def to_px(self, points: np.ndarray) -> np.ndarray:
         """Map points (n, 2) of the plane z = 0, metres, to the picture, (n, 2)."""
         left, _, _, top = self.extent
+        # Rows count downwards from the top, y upwards
         offset = np.asarray(points, np.float64) - [left, top]
         return offset * [1, -1] / self.metres_per_px
 
