@@ -109,12 +109,11 @@ class FrozenComposite:
         self._first: AbstractSceneMarch | None = None
         self._render = freeze_method(self._record, self._state)
 
-    def render(self, rays: Rays, width: int) -> Seen:
+    def render(self, rays: Rays) -> Seen:
         """See :meth:`AbstractComposite.render`; evaluates, so not while recording.
 
         Args:
             rays: n rays, without literals.
-            width: rays in a row.
         """
         _, posed, stop = self._parts
         kept: list[March | None] = []
@@ -122,10 +121,10 @@ class FrozenComposite:
             if isinstance(layer, AbstractBackdrop):  # cannot be recorded
                 kept.append(layer.march(rays, stop))
             else:
-                kept.append(self._scene(rays, width) if k == 0 else None)
+                kept.append(self._scene(rays) if k == 0 else None)
         return self._render(rays, kept)
 
-    def _scene(self, rays: Rays, width: int) -> March | None:
+    def _scene(self, rays: Rays) -> March | None:
         """March the first layer, mostly the scene, in the fastest way, if there is."""
         composite, posed, stop = self._parts
         if posed[0].has_gradients:
@@ -134,7 +133,7 @@ class FrozenComposite:
             self._first = composite.ahead(posed[0], stop)
         if self._first is None:
             return None
-        return self._first.march(replace(rays, gains=rays.gains[:1]), width)
+        return self._first.march(replace(rays, gains=rays.gains[:1]))
 
     def _record(self, rays: Rays, kept: list[March | None]) -> Seen:
         composite, posed, stop = self._parts

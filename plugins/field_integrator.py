@@ -236,20 +236,20 @@ class FieldIntegrator(FilmIntegrator):
         state_in: Any = None,
         active: Mask = True,
         δsplats: Any = None,
-        width: int = 0,
+        frozen: bool = False,
         gains: Sequence[Gain] = (),
         **kwargs: Any,
     ) -> tuple[Any, mi.Bool, list[mi.Float], Any]:
         """Integrate one ray per lane; see Mitsuba's ``RBIntegrator.sample``.
 
         A film gives cotangents of :meth:`splats` as ``δsplats``, and finds tangents in
-        the place of the state. ``width``: rays in a row of an image, if nothing is
-        being recorded. ``gains``: light on each field.
+        the place of the state. ``frozen``: replay recordings, where nothing is being
+        recorded. ``gains``: light on each field.
         """
         del depth, kwargs
         is_primal = mode == dr.ADMode.Primal
         # Inside `moment`, which leaves the derivatives to Dr.Jit
-        if is_primal and not width and (leaves := limits.attached(scene)):
+        if is_primal and not frozen and (leaves := limits.attached(scene)):
             where = "inside another integrator; take the fields out of it"
             limits.check_ray(ray, where)
             call = {"scene": scene, "sampler": sampler, "ray": ray, "active": active}
@@ -263,7 +263,7 @@ class FieldIntegrator(FilmIntegrator):
         # I and a of the fields (A.1 to A.6), and L_b behind them
         if state_in is None:  # primal mode, or forward mode, which comes without
             inner = sampler if is_primal else sampler.clone()
-            state_in = look(self, scene, inner, ray, rays, width)
+            state_in = look(self, scene, inner, ray, rays, frozen)
         state: State = state_in
         rays.gains = state.gains
         valid = state.seen.total.opacity > 0

@@ -76,7 +76,7 @@ def look(
     sampler: mi.Sampler,
     ray: mi.Ray3f,
     rays: Rays,
-    width: int,
+    frozen: bool,
 ) -> State:
     """March the fields of a `field_integrator`, and see what lies behind them.
 
@@ -86,7 +86,7 @@ def look(
         sampler: of random numbers.
         ray: n rays.
         rays: the same, as far as fields are concerned.
-        width: rays in a row, where nothing is being recorded; 0 otherwise.
+        frozen: replay recordings; where nothing is being recorded.
     """
     light = integrator.relighting
     if light is not None:
@@ -94,9 +94,9 @@ def look(
         more = rays.gains or [Gain()] * len(found)
         pairs = zip(found, more, strict=True)
         rays.gains = [Gain(colour * gain.colour, gain.row) for colour, gain in pairs]
-    if width:
+    if frozen:
         dr.make_opaque(rays)
-        seen = integrator.frozen.render(rays, width)
+        seen = integrator.frozen.render(rays)
     else:
         seen = integrator.composite.render(integrator.posed, rays, integrator.stop)
     if integrator.behind is None:

@@ -139,7 +139,7 @@ class AbstractField(ABC):
 
     def arrays(self) -> list[Any]:
         """Return the Dr.Jit arrays that :meth:`eval` and the occupancy read."""
-        skipping = [*self.occupancy.arrays, self.window.array]
+        skipping = [self.occupancy.words, self.window.array]
         return [*self.parameters().values(), *skipping]
 
     @property
@@ -167,8 +167,12 @@ class AbstractField(ABC):
     def unit(self, point: mi.Point3f) -> mi.Point3f:
         """Map a point of the field's frame to [0, 1]^3 of its bounding box."""
         lower = mi.Point3f(*[float(v) for v in self.lower])
+        return mi.Point3f(self.unit_vector(mi.Vector3f(point - lower)))
+
+    def unit_vector(self, vector: mi.Vector3f) -> mi.Vector3f:
+        """Map a difference of points of the field's frame to one in [0, 1]^3."""
         inverse = mi.Vector3f(*[1.0 / float(v) for v in self.upper - self.lower])
-        return mi.Point3f((point - lower) * inverse)
+        return mi.Vector3f(vector * inverse)
 
 
 def check_sky(image: np.ndarray) -> None:

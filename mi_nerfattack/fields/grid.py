@@ -331,7 +331,7 @@ class GridField(AbstractField):
     def arrays(self) -> list[Any]:
         """Return `packed`, the lattice of one level, occupancy and window."""
         lattice = [] if self._marched is None else self._marched.lattice
-        return [self.packed, *lattice, *self.occupancy.arrays, self.window.array]
+        return [self.packed, *lattice, self.occupancy.words, self.window.array]
 
     @property
     def has_gradients(self) -> bool:

@@ -20,9 +20,10 @@ class Occupancy:
 
     A cell that holds ``n > 0`` is empty, and so are all cells closer than ``n`` to
     it: a ray may leave the whole block of ``2 n - 1`` cells in one jump. Cells that
-    hold 0 are occupied. Costs one byte a cell.
+    hold 0 are occupied.
 
-    Of occupied cells, a march may skip single octants.
+    Of occupied cells, a march may skip single octants. Costs one byte a cell, or four
+    with octants.
 
     Args:
         cells: boolean (rx, ry, rz), True where the field may have density.
@@ -50,11 +51,13 @@ class Occupancy:
 
             far: Any = ndimage.distance_transform_cdt(~seen, metric="chessboard")
             distance = np.minimum(far, MAX_DISTANCE).astype(np.uint8)
-        grids = [distance] if self.octants is None else [distance, self.octants]
-        byte = dr.uint8_array_t(mi.Float)
-        #: What :meth:`query` reads, (rx ry rz,) each.
-        self.arrays: list[Any] = [upload(byte, grid) for grid in grids]
-        dr.make_opaque(self.arrays)
+        if self.octants is None:
+            words = np.pad(distance.ravel(), (0, -distance.size % 4)).view("<u4")
+        else:
+            words = distance | self.octants.astype(np.uint32) << 8
+        #: What :meth:`query` reads: four distances, or one, and above it the octants.
+        self.words: mi.UInt32 = upload(mi.UInt32, words)
+        dr.make_opaque(self.words)
 
     @staticmethod
     def full(resolution: int = 1) -> Occupancy:
@@ -97,15 +100,15 @@ class Occupancy:
             dr.clip(dr.floor(unit.z * rz), 0, rz - 1),
         )
         index = (mi.UInt32(cell.x) * ry + mi.UInt32(cell.y)) * rz + mi.UInt32(cell.z)
-        first, *more = self.arrays
-        distance = mi.Float(mi.UInt32(dr.gather(type(first), first, index, active)))
-        for octants in more:
-            inside = active & (distance == 0)
-            bits = mi.UInt32(dr.gather(type(octants), octants, index, inside))
-            for axis, weight in enumerate((4, 2, 1)):
-                upper = unit[axis] * self.shape[axis] - cell[axis] >= 0.5
-                bits >>= dr.select(upper, mi.UInt32(weight), 0)
-            distance = dr.select(inside & (bits & 1 == 0), 0.5, distance)
+        if self.octants is None:
+            word = dr.gather(mi.UInt32, self.words, index >> 2, active)
+            return mi.Float((word >> 8 * (index & 3)) & MAX_DISTANCE), cell
+        word = dr.gather(mi.UInt32, self.words, index, active)
+        distance, bits = mi.Float(word & MAX_DISTANCE), word >> 8
+        for axis, weight in enumerate((4, 2, 1)):
+            upper = unit[axis] * self.shape[axis] - cell[axis] >= 0.5
+            bits >>= dr.select(upper, mi.UInt32(weight), 0)
+        distance = dr.select((distance == 0) & (bits & 1 == 0), 0.5, distance)
         return distance, cell
 
     def exit(

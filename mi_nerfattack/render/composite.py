@@ -278,7 +278,19 @@ def nothing(rays: Rays) -> Seen:
 def _see(item: Layer, rays: Rays, stop: float) -> March:
     if isinstance(item, AbstractBackdrop):
         return item.march(rays, stop)
-    return march(item, rays, stop)
+    return _march_where_it_is(item, rays, stop)
+
+
+@dr.syntax
+def _march_where_it_is(posed: PosedField, rays: Rays, stop: float) -> March:
+    """March; a vector of rays of which none meets the field's box does nothing."""
+    found = March()
+    with dr.suspend_grad():
+        o, d = posed.to_local(rays.origin, rays.direction)
+        near, far = posed.interval(o, d, rays.t_max)
+        if rays.active & (near < far):
+            found = march(posed, rays, stop)
+    return found
 
 
 def _derive(

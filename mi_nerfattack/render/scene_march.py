@@ -7,7 +7,6 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from mi_nerfattack.backend.freeze import freeze_method
 from mi_nerfattack.errors import InputError
@@ -15,8 +14,8 @@ from mi_nerfattack.fields.cpu.ngp import PackedNGP
 from mi_nerfattack.fields.ngp import NGPField
 from mi_nerfattack.render.march import integrate, march
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.rays import Gain, March, Rays, pick_rays, put_rays
-from mi_nerfattack.render.walk import Walk
+from mi_nerfattack.render.rays import Gain, March, Rays
+from mi_nerfattack.render.walk import Walk, clear_distance
 
 
 def nearest_surface(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
@@ -69,9 +68,6 @@ def _walk_through(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
     return nearest
 
 
-_TILE = 4
-
-
 class AbstractSceneMarch(ABC):
     """A way to march rays through one field whose parameters are constants.
 
@@ -83,35 +79,31 @@ class AbstractSceneMarch(ABC):
     def __init__(self, posed: PosedField, stop: float) -> None:
         self.posed = posed
         self.stop = stop
-        self._orders: dict[tuple[int, int], mi.UInt32] = {}
         self._frozen = freeze_method(self._record, self._state)
 
-    def march(self, rays: Rays, width: int = 1) -> March:
+    def march(self, rays: Rays) -> March:
         """Integrate radiance, opacity and moment; as `render.march.march`.
 
         Args:
-            rays: n rays, with gains for one field or none.
-            width: pixels in a row, where rays come row by row; their order changes
-                nothing but the time.
+            rays: n rays, with gains for one field or none; neighbours one after the
+                other, or it takes longer.
 
         Returns:
             the march, (n,), evaluated.
         """
-        key = dr.width(rays), width
-        if key not in self._orders:
-            self._orders[key] = tile_order(*key)
-        return self._frozen(_opaque(rays), self._orders[key])
+        last = dr.opaque(mi.UInt32, dr.width(rays.direction) - 1)
+        return self._frozen(_opaque(rays), last)
 
-    def _record(self, rays: Rays, order: mi.UInt32) -> March:
+    def _record(self, rays: Rays, last: mi.UInt32) -> March:
         with dr.suspend_grad():
-            return put_rays(self._march(pick_rays(rays, order)), order)
+            return self._march(rays, clear_distance(self.posed, rays, last))
 
     @abstractmethod
-    def _march(self, rays: Rays) -> March:
-        """March rays in their order."""
+    def _march(self, rays: Rays, clear: mi.Float) -> March:
+        """March rays, which meet empty cells alone for so many metres (n,)."""
 
     @abstractmethod
-    def _state(self, rays: Rays, order: mi.UInt32) -> list[Any]:
+    def _state(self, rays: Rays, last: mi.UInt32) -> list[Any]:
         """Return what :meth:`_march` reads or was compiled for, for `drjit.freeze`."""
 
 
@@ -132,12 +124,12 @@ def scene_march(posed: PosedField, stop: float) -> AbstractSceneMarch:
 class FieldMarch(AbstractSceneMarch):
     """Any field, any backend: `render.march.march`, recorded once."""
 
-    def _march(self, rays: Rays) -> March:
+    def _march(self, rays: Rays, clear: mi.Float) -> March:
         (posed,) = rays.light([self.posed])
-        return march(posed, rays, self.stop)
+        return march(posed, rays, self.stop, clear)
 
-    def _state(self, rays: Rays, order: mi.UInt32) -> list[Any]:
-        del order
+    def _state(self, rays: Rays, last: mi.UInt32) -> list[Any]:
+        del last
         return [self, self.stop, dr.width(rays.direction), self.posed.state()]
 
 
@@ -160,15 +152,15 @@ class PackedMarch(AbstractSceneMarch):
         self._field = posed.field
         self._packed = PackedNGP(posed.field)
 
-    def march(self, rays: Rays, width: int = 1) -> March:
+    def march(self, rays: Rays) -> March:
         """See :meth:`AbstractSceneMarch.march`."""
         if not self._packed.is_current():
             self._packed = PackedNGP(self._field)
-        return super().march(rays, width)
+        return super().march(rays)
 
-    def _march(self, rays: Rays) -> March:
+    def _march(self, rays: Rays, clear: mi.Float) -> March:
         view = self._packed.view(dr.normalize(self.posed.turn(rays.direction)))
-        walk, active = Walk.start(self.posed, rays)
+        walk, active = Walk.start(self.posed, rays, clear)
         posed, looks = [self.posed], ([self._evaluate], [view])
         result = integrate(posed, walk, active, *looks, self.stop).march()
         for (gain,) in [rays.gains] if rays.gains else []:
@@ -181,26 +173,10 @@ class PackedMarch(AbstractSceneMarch):
         density, colour = self._packed.eval(point, view, active)
         return self.posed.in_world(density), colour
 
-    def _state(self, rays: Rays, order: mi.UInt32) -> list[Any]:
-        del order
+    def _state(self, rays: Rays, last: mi.UInt32) -> list[Any]:
+        del last
         sizes = [dr.width(rays.direction), self._field.layout]
         return [self, self.stop, sizes, self._packed.state(), self.posed.state()]
-
-
-def tile_order(count: int, width: int) -> mi.UInt32:
-    """Return the indices of pixels tile by tile, (n,): 4 x 4 are a vector's lanes.
-
-    Rays side by side end together, and no lane waits for others.
-
-    Args:
-        count: of pixels, n.
-        width: pixels in a row.
-    """
-    row, column = np.divmod(np.arange(count), width)
-    order = np.lexsort((column, row, column // _TILE, row // _TILE))
-    result = mi.UInt32(order.astype(np.uint32).tolist())
-    dr.make_opaque(result)
-    return result
 
 
 def _opaque(rays: Rays) -> Rays:

@@ -3,6 +3,10 @@
 A :class:`Walk` follows the lattice of one field. A :class:`MergedWalk` merges the
 lattice intervals of all fields into segments on which the set of fields does not
 change; each is one sample.
+
+Most lattice intervals that a march looks at lie in the air between the camera and the
+first surface. Rays side by side cross the same air, so a bundle of them is followed
+once, from one block of empty cells to the next (:func:`clear_distance`).
 """
 
 from __future__ import annotations
@@ -13,10 +17,13 @@ from dataclasses import dataclass, field
 import drjit as dr
 import mitsuba as mi
 
+from mi_nerfattack.fields.occupancy import Occupancy
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.rays import Rays
+from mi_nerfattack.render.rays import Rays, pick_rays
 
 MAX_INTERVALS = 1 << 23  # float32 counts exactly up to twice this
+BUNDLE = 16  # rays
+_MARGIN = 1e-3  # cells; thirty times what single precision rounds off
 
 
 @dataclass
@@ -112,11 +119,22 @@ class Walk:
     index: mi.Float = field(default_factory=lambda: mi.Float(0))
 
     @staticmethod
-    def start(posed: PosedField, rays: Rays) -> tuple[Walk, mi.Bool]:
-        """Return rays before their first interval, and those that meet the box."""
+    def start(
+        posed: PosedField, rays: Rays, clear: mi.Float | None = None
+    ) -> tuple[Walk, mi.Bool]:
+        """Return rays before their first interval, and those that meet the box.
+
+        Args:
+            posed: the field.
+            rays: n rays.
+            clear: (n,), metres on which rays meet empty cells alone.
+        """
         path = Path.of(posed, rays)
         active = mi.Bool(rays.active) & (path.near < path.far)
-        return Walk([path], rays.jitter, mi.Float(0)), active
+        walk = Walk([path], rays.jitter, mi.Float(0))
+        if clear is not None:
+            walk.index = dr.maximum(path.interval(posed, clear - path.begin), 0)
+        return walk, active
 
     def next(
         self, posed: Sequence[PosedField], active: mi.Bool
@@ -154,8 +172,8 @@ def seek(
         distance, cell = occupancy.query(unit, searching)
         found = searching & (distance == 0)
         searching &= ~found
-        scale = posed.field.unit(mi.Point3f(path.d)) - posed.field.unit(mi.Point3f(0))
-        leaving = s + occupancy.exit(unit, mi.Vector3f(scale), cell, distance)
+        rate = posed.field.unit_vector(path.d)
+        leaving = s + occupancy.exit(unit, rate, cell, distance)
         jump = dr.maximum(index + 1, path.interval(posed, leaving))
         index = dr.select(searching, jump, index)
     return index, path.begin + s, dr.maximum(width, 0), found
@@ -265,3 +283,88 @@ def sample_count(posed: PosedField, rays: Rays) -> mi.Float:
         active = here.active
         count += dr.select(active, 1.0, 0.0)
     return count
+
+
+@dataclass
+class Range:
+    """Smallest box around points or directions of a bundle's rays.
+
+    Attributes:
+        lower: (3, m), in the unit box of a field.
+        upper: (3, m), as `lower`.
+    """
+
+    lower: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(dr.inf))
+    upper: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(-dr.inf))
+
+    def around(self, more: mi.Vector3f) -> Range:
+        """Return the range that holds `more`, too."""
+        return Range(dr.minimum(self.lower, more), dr.maximum(self.upper, more))
+
+
+def clear_distance(posed: PosedField, rays: Rays, last: mi.UInt32) -> mi.Float:
+    """Return how far rays go before one of their bundle may meet a field.
+
+    Args:
+        posed: the field; its occupancy alone is looked at.
+        rays: n rays, neighbours one after the other.
+        last: n - 1, opaque, so that no number becomes code.
+
+    Returns:
+        metres (n,); 0 where a bundle is too wide for the empty cells where it begins.
+    """
+    count = dr.width(rays.direction)
+    first = BUNDLE * dr.arange(mi.UInt32, -(-count // BUNDLE))
+    begin, rate = _enclose(posed, rays, first, last)
+    least = posed.lattice(mi.Float(1))
+    clear = _follow(posed.field.occupancy, begin, rate, least)
+    return dr.gather(mi.Float, clear, dr.arange(mi.UInt32, count) // BUNDLE)
+
+
+@dr.syntax
+def _enclose(
+    posed: PosedField, rays: Rays, first: mi.UInt32, last: mi.UInt32
+) -> tuple[Range, Range]:
+    """Return ranges of where bundles (m,) begin, and of their way in a metre."""
+    begin, rate = Range(), Range()
+    k = mi.UInt32(0)
+    while k < BUNDLE:
+        place = dr.minimum(first + k, last)
+        ray = pick_rays([rays.origin, rays.direction], place)
+        o, d = posed.to_local(ray[0], ray[1])
+        begin = begin.around(mi.Vector3f(posed.field.unit(o)))
+        rate = rate.around(posed.field.unit_vector(d))
+        k += 1
+    return begin, rate
+
+
+@dr.syntax
+def _follow(
+    occupancy: Occupancy, begin: Range, rate: Range, least: mi.Float
+) -> mi.Float:
+    """Return how far bundles (m,) stay in empty cells, metres.
+
+    Args:
+        occupancy: the cells.
+        begin: where they begin.
+        rate: their way in a metre.
+        least: length of a way that is worth another look, metres.
+    """
+    shape = mi.Vector3f(occupancy.shape)
+    t = mi.Float(0)
+    going = mi.Bool(True)
+    while going:
+        # A block of empty cells around the middle; two corners hold the whole bundle
+        lower = begin.lower + t * rate.lower - _MARGIN / shape
+        upper = begin.upper + t * rate.upper + _MARGIN / shape
+        distance, cell = occupancy.query(mi.Point3f(0.5 * (lower + upper)), going)
+        going &= distance >= 1
+        going &= dr.all(dr.abs(dr.floor(lower * shape) - cell) < distance)
+        going &= dr.all(dr.abs(dr.floor(upper * shape) - cell) < distance)
+        # Up to where one of them leaves it
+        first = occupancy.exit(mi.Point3f(lower), rate.lower, cell, distance)
+        other = occupancy.exit(mi.Point3f(upper), rate.upper, cell, distance)
+        way = dr.select(going, dr.minimum(first, other), 0)
+        t += way
+        going &= (way > least) & (t < dr.inf)
+    return t

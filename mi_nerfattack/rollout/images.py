@@ -162,7 +162,7 @@ class SceneImages:
             δaovs=None,
             state_in=state_in,
             active=mi.Bool(True),
-            width=camera.size[0] * camera.spp,
+            frozen=True,
             **lit,
         )
 

@@ -23,7 +23,6 @@ from mi_nerfattack.render.scene_march import (
     FieldMarch,
     PackedMarch,
     scene_march,
-    tile_order,
 )
 from mi_nerfattack.render.walk import sample_count
 from mi_nerfattack.scenes import bundled
@@ -144,20 +143,6 @@ def test_changed_parameters_are_followed(rng):
         np.testing.assert_allclose(seen[-1], np.array(expected.radiance), atol=2e-5)
     np.testing.assert_array_equal(seen[0], seen[3])
     assert all(np.abs(x - y).max() > 0.01 for x, y in zip(seen, seen[1:], strict=False))
-
-
-@pytest.mark.parametrize(("width", "height"), [(8, 4), (10, 7), (3, 5)])
-def test_tiles_hold_neighbours_and_change_nothing(rng, width, height):
-    order = tile_order(width * height, width).numpy()
-    assert sorted(order) == list(range(width * height))
-    row, column = np.divmod(order[:16], width)
-    assert min(width, height) < 4 or row.max() == column.max() == 3
-    scene = PackedMarch(PosedField(small_ngp()), STOP)
-    rays = random_rays(rng, width * height)
-    one, other = scene.march(rays), scene.march(rays, width=width)
-    for name in ("radiance", "opacity", "moment"):
-        first, second = (np.array(getattr(found, name)) for found in (one, other))
-        np.testing.assert_array_equal(first, second)
 
 
 def test_nothing_is_compiled_for_other_rays():
