@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections import Counter
 from pathlib import Path
@@ -122,6 +123,26 @@ def test_patches_of_two_resolutions_equal_their_rows(name, pixels):
         left, count = lit[lit["case"] == "attack"]["departed"].agg(["sum", "count"])
         assert f"the scene lights, {left} of {count} drives left the lane" in words
         assert not rows[rows["case"] == "random"]["departed"].any()
+
+
+def test_the_table_of_coarse_colours_equals_its_rows():
+    text = (ROOT / "docs/howto/robust.md").read_text("utf-8")
+    pattern = r"^\| (\w+) \| ([\d and]+) \| ([\d.]+) \| ([\d.]+) \|$"
+    shown = re.findall(pattern, text, re.M)
+    rows = read_table(ROOT / "bench/resolution/results.csv")
+    rows = rows[rows["case"] == "attack"]
+    methods = {"64 and 129": "fine", "32": "coarse_32", "16": "coarse_16"}
+    assert len(shown) == rows.groupby(["route", "method"]).ngroups == 9
+    by = ["route", "method", "environment"]
+    means = rows.groupby(by)["cross_track_mean_m"].mean()
+    for route, vertices, *figures in shown:
+        method = methods[vertices]
+        found = [means[route, method, where] for where in ("surrogate", "built_in")]
+        assert [f"{mean:.3f}" for mean in found] == figures
+    shares = means.xs("built_in", level=2) / means.xs("surrogate", level=2)
+    kept = shares.map(math.log).groupby("method").mean().map(math.exp)
+    told = f"{kept['fine']:.2f} to {kept['coarse_16']:.2f} only"
+    assert told in " ".join(text.split())
 
 
 def test_the_table_of_fits_equals_its_file():
