@@ -381,15 +381,15 @@ class FieldIntegrator(FilmIntegrator):
         limits.check_camera(self, scene, limits.ATTACHED)
 
     def keep(self, state: State) -> State:
-        """Return a state whose march is that part of it which is costly."""
+        """Return a state of which only that is left which is costly."""
         seen: Any = self.composite.keep(state.seen)
-        return replace(state, seen=seen)
+        return replace(state, seen=seen, gains=state.gains if self.relighting else [])
 
-    def restore(self, ray: mi.Ray3f, kept: State) -> State:
+    def restore(self, ray: mi.Ray3f, kept: State, gains: Sequence[Gain]) -> State:
         """Return the state of rays that :meth:`keep` was given."""
-        rays = Rays(ray.o, ray.d, gains=kept.gains)
+        rays = Rays(ray.o, ray.d, gains=kept.gains or list(gains))
         seen = self.composite.restore(self.posed, rays, kept.seen, self.stop)
-        return replace(kept, seen=seen)
+        return replace(kept, seen=seen, gains=rays.gains)
 
     def to_string(self) -> str:
         """Describe the checked parameters."""

@@ -12,7 +12,14 @@ import drjit as dr
 from mi_nerfattack.render.backdrop import AbstractBackdrop, Layer, fields_by_rays
 from mi_nerfattack.render.march import RayGradient, march, march_derivative
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.rays import March, Rays, Task, select, shares_by_depth
+from mi_nerfattack.render.rays import (
+    March,
+    Rays,
+    Sparse,
+    Task,
+    select,
+    shares_by_depth,
+)
 from mi_nerfattack.render.scene_march import AbstractSceneMarch, scene_march
 
 
@@ -181,8 +188,13 @@ class DepthComposite(AbstractComposite):
         return shares_by_depth(seen.layers)
 
     def keep(self, seen: Seen) -> Any:
-        """See :meth:`AbstractComposite.keep`: all layers, 20 bytes a ray and layer."""
-        return seen.layers
+        """See :meth:`AbstractComposite.keep`: 20 bytes a layer and ray that meets it.
+
+        A ray that meets a layer is 24 bytes where these are less than half of the rays.
+        """
+        kept = [Sparse.of(layer) for layer in seen.layers]
+        dr.eval(kept)
+        return kept
 
     def restore(
         self, posed: Sequence[Layer], rays: Rays, kept: Any, stop: float
@@ -190,7 +202,7 @@ class DepthComposite(AbstractComposite):
         """See :meth:`AbstractComposite.restore`; marches the layers that are None."""
         layers = [
             _see(item, rays, stop) if layer is None else layer
-            for item, layer in zip(rays.light(posed), kept, strict=True)
+            for item, layer in zip(rays.light(posed), map(_full, kept), strict=True)
         ]
         return Seen(depth_composite(layers), layers) if layers else nothing(rays)
 
@@ -273,6 +285,10 @@ class DepthComposite(AbstractComposite):
 def nothing(rays: Rays) -> Seen:
     """Return what is seen of no layers."""
     return Seen(dr.zeros(March, dr.width(rays.direction)), [])
+
+
+def _full(layer: March | Sparse | None) -> March | None:
+    return layer.full() if isinstance(layer, Sparse) else layer
 
 
 def _see(item: Layer, rays: Rays, stop: float) -> March:

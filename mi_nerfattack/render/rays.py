@@ -64,14 +64,15 @@ def pick_rays(value: Any, index: mi.UInt32) -> Any:
     return value if dr.width(value) == 1 else dr.gather(type(value), value, index)
 
 
-def put_rays(march: March, index: mi.UInt32) -> March:
+def put_rays(march: March, index: mi.UInt32, count: int) -> March:
     """Undo `pick_rays` of what was marched: entry k goes to `index[k]`.
 
     Args:
-        march: (n,).
-        index: (n,), each number below n once.
+        march: (m,).
+        index: (m,), distinct numbers below `count`; other rays are empty.
+        count: n, of all rays.
     """
-    result = March.zeros(dr.width(index))
+    result = March.zeros(count)
     put(result, march, index)
     return result
 
@@ -167,6 +168,34 @@ class March:
         """Expected depth (A.3, normalised), metres; infinite where opacity is 0."""
         hit = self.opacity > 0
         return dr.select(hit, self.moment / dr.select(hit, self.opacity, 1), dr.inf)
+
+
+@dataclass
+class Sparse:
+    """A march of many rays of which few meet anything, without the others.
+
+    Attributes:
+        march: (m,), of the rays that meet something.
+        index: (m,), which rays they are.
+        count: n, of all rays.
+    """
+
+    march: March
+    index: mi.UInt32
+    count: int
+
+    @staticmethod
+    def of(march: March) -> March | Sparse:
+        """Leave out the rays that meet nothing, where these are most; evaluates."""
+        count = dr.width(march)
+        index = dr.compress(march.differs())
+        if 2 * dr.width(index) > count:
+            return march
+        return Sparse(pick_rays(march, index), index, count)
+
+    def full(self) -> March:
+        """Return the march of all rays."""
+        return put_rays(self.march, self.index, self.count)
 
 
 def shares_by_depth(layers: Sequence[March]) -> list[March]:

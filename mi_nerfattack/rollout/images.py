@@ -68,9 +68,14 @@ class SceneImages:
         return observation.linear, observation.kept
 
     def restore(
-        self, camera: SceneCamera, state: Any, step: int, kept: Any
+        self,
+        camera: SceneCamera,
+        state: Any,
+        step: int,
+        kept: Any,
+        gains: Sequence[Gain],
     ) -> Observation:
-        """See :meth:`AbstractDifferentiableSensor.restore`."""
+        """Return what :meth:`observe` gave, from what :meth:`keep` kept of it."""
         count = dr.width(state)
         # The same rays again, whose fields are not marched again
         with dr.suspend_grad():
@@ -79,7 +84,7 @@ class SceneImages:
                 linear, inner = kept
             else:
                 dr.eval(view)
-                inner = self.collector.restore(view[0], kept)
+                inner = self.collector.restore(view[0], kept, gains)
                 linear, inner = self._render(camera, sampler, view, inner)
         return _observation(camera, linear, inner, view, count, step)
 

@@ -12,6 +12,7 @@ import numpy as np
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.vertex_colours import gradient, start_gradient
+from mi_nerfattack.render.rays import Gain
 
 
 @runtime_checkable
@@ -33,8 +34,8 @@ class CollectsRays(Protocol):
     def keep(self, state: Any) -> Any:
         """Return the costly part of a state that `sample` gave."""
 
-    def restore(self, ray: mi.Ray3f, kept: Any) -> Any:
-        """Return the state again, for the same rays."""
+    def restore(self, ray: mi.Ray3f, kept: Any, gains: Sequence[Gain]) -> Any:
+        """Return the state again, for the same rays in the same light."""
 
 
 class Differentiated:

@@ -168,7 +168,7 @@ class SceneSensor(AbstractDifferentiableSensor):
     def restore(self, state: Any, step: int, kept: Any) -> Observation:
         """See :meth:`AbstractDifferentiableSensor.restore`."""
         parts = [
-            self._images.restore(camera, state, step, one)
+            self._images.restore(camera, state, step, one, self._gains(camera, state))
             for camera, one in zip(self.cameras, kept, strict=True)
         ]
         return self._join(parts)

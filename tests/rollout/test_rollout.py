@@ -266,15 +266,28 @@ def test_kept_frames_are_not_rendered_again():
     rollout = make_rollout(loop, 3, adjoint="kept")
     evaluation = rollout.run(loop.initial(INITIAL))
     kept = evaluation.trajectory.kept
-    marches = [march for (state,), _ in kept for march in state.seen]
-    arrays = [(*march.radiance, march.opacity, march.moment) for march in marches]
-    floats = sum(dr.width(array) for parts in arrays for array in parts)
-    assert 4 * floats == 3 * toy.WIDTH * toy.HEIGHT * 2 * 20  # as its docstring says
+    samples = toy.WIDTH * toy.HEIGHT
+    for scene, thing in (state.seen for (state,), _ in kept):
+        met = dr.width(thing.index)  # by the object
+        assert 0 < met < samples / 2 < samples == dr.width(scene) == thing.count
+        assert dr.width(thing.march) == met
+        assert dr.all(thing.march.opacity > 0)
     before = loop.sensor.renders
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(composite, "march", None)  # of fields, while a kernel is traced
         rollout.gradient(evaluation)
     assert loop.sensor.renders == before
+
+
+def test_what_is_kept_gives_the_same_image_again():
+    loop, _ = toy.make_loop()
+    sensor, state = loop.sensor, loop.initial(INITIAL)
+    seen = sensor.observe(state, 2)
+    again = sensor.restore(state, 2, sensor.keep(seen))
+    assert dr.all(seen.image.array == again.image.array)
+    for one, other in zip(seen.kept.seen.layers, again.kept.seen.layers, strict=True):
+        for name in ("radiance", "opacity", "moment"):
+            assert dr.all(getattr(one, name) == getattr(other, name), axis=None)
 
 
 def test_sensors_die_safely_while_others_record():

@@ -137,7 +137,7 @@ class SplatBackground(AbstractBackdrop):
             shades = self._shade(lists.near, lists.near.ahead)
             dr.eval(shades)
             found = blend(by_cell(rays, where, lists), lists, shades, stop)
-            result = put_rays(found, where.order)
+            result = put_rays(found, where.order, dr.width(where.order))
             dr.eval(result)
             return result
 
@@ -182,7 +182,7 @@ class SplatBackground(AbstractBackdrop):
                 )
                 dr.eval(tangent, by_rays)
             if mode == dr.ADMode.Forward:
-                return put_rays(tangent, where.order), none[1]
+                return put_rays(tangent, where.order, dr.width(where.order)), none[1]
             with dr.resume_grad():
                 by_shades = dr.grad(shades)
                 flags = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad  # of degree 0
