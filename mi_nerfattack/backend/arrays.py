@@ -81,6 +81,25 @@ def put(target: Any, part: Any, place: mi.UInt32) -> None:
         dr.scatter(target, part, place)
 
 
+def allocated_bytes(value: Any) -> int:
+    """Return the bytes that Dr.Jit holds for the arrays of lists and dataclasses.
+
+    Its allocator rounds each array up to a power of two.
+    """
+    if isinstance(value, list | tuple):
+        return sum(map(allocated_bytes, value))
+    if is_dataclass(value):
+        return sum(allocated_bytes(getattr(value, item.name)) for item in fields(value))
+    if not dr.is_array_v(value):
+        return 0
+    if dr.is_tensor_v(value):
+        return allocated_bytes(value.array)
+    if dr.depth_v(value) > 1:
+        return sum(map(allocated_bytes, value))
+    size = dr.width(value) * dr.itemsize_v(value)
+    return 1 << (size - 1).bit_length() if size else 0
+
+
 def upload(kind: Any, values: np.ndarray) -> Any:
     """Copy an array to a flat one of a type, such as `mi.Float`, in Dr.Jit's memory.
 

@@ -12,6 +12,7 @@ from support.reference.derivatives import nothing_compiled
 from mi_nerfattack.backend.arrays import (
     adam_tensors,
     aligned,
+    allocated_bytes,
     concat,
     load_adam,
     split,
@@ -175,3 +176,12 @@ def test_aligned_memory_holds_the_same(shape, kind, rng):
             assert copy.ctypes.data % 64 == 0
         np.testing.assert_array_equal(copy, part)
         assert copy.dtype == kind
+
+
+def test_bytes_are_counted_as_they_are_allocated():
+    five, tensor = dr.zeros(mi.Float, 5), mi.TensorXf(dr.zeros(mi.Float, 3), (3, 1))
+    assert allocated_bytes(five) == 32
+    assert allocated_bytes([dr.zeros(mi.Color3f, 5), (tensor, None, "text")]) == 112
+    assert allocated_bytes(Gain(dr.zeros(mi.Color3f, 8), dr.zeros(mi.UInt32, 9))) == 160
+    assert allocated_bytes(dr.zeros(mi.Bool, 3)) == 4
+    assert allocated_bytes(mi.Float()) == 0

@@ -7,8 +7,10 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from mi_nerfattack.attack.black_box.random_looks import equal_count
-from mi_nerfattack.render.interleaved import InterleavedComposite
+from mi_nerfattack.backend.arrays import allocated_bytes
 from mi_nerfattack.rollout.adjoint import KeptBackgrounds
 from mi_nerfattack.scenario.deployment import SURROGATE, labelled
 from mi_nerfattack.scenario.scenario import Scenario
@@ -16,9 +18,7 @@ from mi_nerfattack.scenario.world import World, build_attack, driven_route
 from mi_nerfattack.system.machine import peak_memory_mb
 
 _PERIODS = 6  # of the iterations that are timed
-_KEPT_BYTES = 20  # of a sample, layer, period and pose
-_BEHIND_BYTES = 13  # of a sample of the nested integrator: colour, and whether it hits
-_LIGHT_BYTES = 16  # of light that varies
+_ALONG = (0.125, 0.375, 0.625, 0.875)  # of the drive: where frames are kept on trial
 _PICTURES_MB = 10.0
 
 
@@ -107,7 +107,7 @@ def estimate(world: World, drive_s: Mapping[str, float]) -> Cost:
         horizon,
         frames,
         wall,
-        peak_memory_mb() + _kept_mb(world),
+        peak_memory_mb() + kept_mb(world),
         disk + _PICTURES_MB,
         {"forward": forward, "backward": backward, **drive_s},
     )
@@ -150,17 +150,19 @@ def _field_bytes(world: World) -> int:
     return total
 
 
-def _kept_mb(world: World) -> float:
-    """Return what `kept_backgrounds` keeps for all periods but the timed ones."""
-    section, sensor = world.scenario.attack, world.surrogate
+def kept_mb(world: World) -> float:
+    """Return what `kept_backgrounds` keeps for all periods but the timed ones, in MB.
+
+    The estimate is made from four frames along the route.
+    """
+    section, sensor = world.scenario.attack, world.optimised
     if not isinstance(section.adjoint, KeptBackgrounds):
         return 0.0
-    kept = _KEPT_BYTES * len(sensor.layers)
-    if isinstance(sensor.integrator.composite, InterleavedComposite):
-        kept += _KEPT_BYTES
-    if sensor.integrator.behind is not None:
-        kept += _BEHIND_BYTES
-    if section.vary.light_ev_sd or section.vary.light_colour_ev_sd or section.vary.sun:
-        kept += _LIGHT_BYTES
-    samples = section.poses * sum(camera.per_image for camera in sensor.cameras)
-    return kept * samples * max(0, world.horizon - _PERIODS) / 1e6
+    period = world.scenario.vehicle.dt_s
+    first, last = world.scenario.drive.stretch(world.route, period)
+    loop, kept = world.loop(sensor), 0
+    for share in _ALONG:
+        pose = world.route.pose_at(first + share * (last - first))
+        state = loop.initial(np.tile(pose, (section.poses, 1)))
+        kept += allocated_bytes(sensor.keep(sensor.observe(state, 0)))
+    return kept / len(_ALONG) * max(0, world.horizon - _PERIODS) / 1e6
