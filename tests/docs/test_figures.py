@@ -94,6 +94,11 @@ def test_the_table_of_the_demo_equals_its_rows():
         mean, out = own["cross_track_mean_m"].mean(), own["departed"].sum()
         metres = f"{mean:.1f}" if mean > 1 else f"{mean:.2f}"
         assert f"| {words} | {metres} m | {out} of {len(own)} |" in text
+    text = (ROOT / "docs/start/first_attack.md").read_text("utf-8")
+    means = rows.groupby(["case", "environment"])["cross_track_mean_m"].mean()
+    for case, digits in (("own", 2), ("random", 2), ("attack", 1)):
+        surrogate, mitsuba = (f"{x:.{digits}f}" for x in means[case][::-1])
+        assert f"| `{case}` | {surrogate} m | {mitsuba} m |" in text
 
 
 @pytest.mark.parametrize("driver", ["expert", "policy"])
