@@ -57,6 +57,23 @@ class BuiltInObject:
         return self.pose.apply(self.vertices)
 
 
+@dataclass(frozen=True, eq=False)
+class Shell:
+    """Geometry of an object whose texels have no colours yet.
+
+    Attributes:
+        corners: (m, 3, 3), of triangles, metres in the object's frame.
+        normals: (m, 3, 3), unit vectors at the corners.
+        atlas: where the triangles lie in the texture.
+        is_smooth: whether the normals differ from those of flat triangles.
+    """
+
+    corners: np.ndarray
+    normals: np.ndarray
+    atlas: Atlas
+    is_smooth: bool
+
+
 def built_in_shapes(objects: Sequence[BuiltInObject]) -> dict[str, Any]:
     """Make Mitsuba meshes, diffuse on both sides, for `load_scene(..., shapes=...)`.
 
@@ -118,6 +135,20 @@ def make_built_in(
         raise InputError(
             f"captured_irradiance: {captured_irradiance}; must be positive and finite"
         )
+    shell = shell_of(field, mesh, placement, texel_m)
+    return paint(shell, field, pose, captured_irradiance)
+
+
+def shell_of(
+    field: GridField,
+    mesh: str | Path | None = None,
+    placement: Placement | None = None,
+    texel_m: float | None = None,
+) -> Shell:
+    """Lay out an object's geometry, which does not depend on the field's colours.
+
+    See :func:`make_built_in` for arguments and errors.
+    """
     texel = 0.5 * voxel_m(field) if texel_m is None else texel_m
     if mesh is None:
         solid = sheet_mesh(field)
@@ -129,7 +160,17 @@ def make_built_in(
         check_same_box(field, solid)
         corners = _outward(field, _solid_corners(solid))
         normals = _flat_normals(corners)
-    atlas = lay_out(corners, texel)
+    return Shell(corners, normals, lay_out(corners, texel), solid is None)
+
+
+def paint(
+    shell: Shell, field: GridField, pose: Pose, captured_irradiance: float = np.pi
+) -> BuiltInObject:
+    """Bake the colours of a field into the texture of its geometry.
+
+    See :func:`make_built_in`.
+    """
+    corners, normals, atlas = shell.corners, shell.normals, shell.atlas
     radiance = _texel_colours(field, atlas, corners, normals)
     albedo = linear_to_uint8(np.pi / captured_irradiance * radiance)
     return BuiltInObject(
@@ -138,7 +179,7 @@ def make_built_in(
         atlas.uv.reshape(-1, 2),
         atlas.image(albedo),
         pose,
-        normals.reshape(-1, 3) if solid is None else None,
+        normals.reshape(-1, 3) if shell.is_smooth else None,
     )
 
 

@@ -88,9 +88,9 @@ class KeptBackgrounds(AbstractAdjoint):
     24 bytes of each object that the sample's ray meets. They hold colour, opacity and
     depth in single precision. The scene at nine rays per pixel is 2.4 MB per vehicle
     and period at 200x66, or 12 MB at 366x188. The `interleaved` composite keeps 20
-    bytes of every layer, and 20 more. Time: as for Replay without rendering. So forward and backward
-    together take less than 2 forward passes where the objects fill little of the frame.
-    Choose this method as long as the memory suffices.
+    bytes of every layer, and 20 more. Time: as for Replay without rendering. So forward
+    and backward together take less than 2 forward passes where the objects fill little
+    of the frame. Choose this method as long as the memory suffices.
     """
 
     kind: Literal["kept_backgrounds"] = "kept_backgrounds"

@@ -10,12 +10,12 @@ from weakref import WeakKeyDictionary
 
 from pydantic import Discriminator, Field, Tag, create_model
 
-from mi_nerfattack.deploy.built_in import BuiltInObject, make_built_in
+from mi_nerfattack.deploy.built_in import BuiltInObject, Shell, paint, shell_of
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.place import Conditions, Place
 from mi_nerfattack.deploy.registry import make_environment, offered_environment
 from mi_nerfattack.fields.grid import GridField
-from mi_nerfattack.io.resumable import array_digest
+from mi_nerfattack.io.resumable import array_digest, json_digest
 from mi_nerfattack.ranges import Count, Finite, NonNegative
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
@@ -28,6 +28,9 @@ SURROGATE = "surrogate"
 #: environments and conditions.
 _BUILT: WeakKeyDictionary[GridField, dict[str, BuiltInObject]] = WeakKeyDictionary()
 _LOOKS = 4  # of a field that are kept
+#: Geometry of what was built in last, by all that decides it.
+_SHELLS: dict[str, Shell] = {}
+_KEPT_SHELLS = 4
 
 Label = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,19}$")]
 Sky = Literal["day", "morning", "noon", "evening", "overcast"]
@@ -218,11 +221,26 @@ def _built_in(field: GridField, pose: Pose) -> BuiltInObject:
     values = [value.numpy() for value in field.parameters().values()]
     key = array_digest([*values, *field.occupancy_tensors().values()])
     looks = _BUILT.setdefault(field, {})
-    found = looks.pop(key, None) or make_built_in(field, pose)
-    looks[key] = found
-    while len(looks) > _LOOKS:
-        del looks[next(iter(looks))]
+    found = looks.pop(key, None) or paint(_shell(field), field, pose)
+    _remember(looks, key, found, _LOOKS)
     return replace(found, pose=pose)
+
+
+def _shell(field: GridField) -> Shell:
+    """Return the geometry of a field, which fields of other colours may share."""
+    density = field.parameters()["density"].numpy()
+    arrays = array_digest([density, *field.occupancy_tensors().values()])
+    key = json_digest([arrays, field.metadata()])
+    found = _SHELLS.pop(key, None) or shell_of(field)
+    _remember(_SHELLS, key, found, _KEPT_SHELLS)
+    return found
+
+
+def _remember(kept: dict[str, Any], key: str, value: Any, most: int) -> None:
+    """Add the newest value, and forget the oldest."""
+    kept[key] = value
+    while len(kept) > most:
+        del kept[next(iter(kept))]
 
 
 def deployments(given: DeploymentSections, place: Place) -> Mapping[str, Deployment]:

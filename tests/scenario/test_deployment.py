@@ -9,7 +9,7 @@ import pytest
 from support.files.runs import HEAD, write_named_files
 from support.worlds.fields import homogeneous
 
-from mi_nerfattack.deploy.built_in import make_built_in
+from mi_nerfattack.deploy.built_in import make_built_in, paint, shell_of
 from mi_nerfattack.deploy.car import CAR
 from mi_nerfattack.deploy.place import Conditions, bundled_place
 from mi_nerfattack.render.camera.pose import Pose
@@ -79,13 +79,19 @@ def test_the_car_with_wheels_is_the_vehicles_size(load):
 
 @pytest.mark.usefixtures("variant")
 def test_a_look_is_built_in_once(monkeypatch):
-    baked, opened = [], []
+    baked, laid_out, opened = [], [], []
 
-    def make(field, pose):
+    def baking(shell, field, pose):
         baked.append(pose)
-        return make_built_in(field, pose)
+        return paint(shell, field, pose)
 
-    monkeypatch.setattr(deployment, "make_built_in", make)
+    def laying_out(field):
+        laid_out.append(field)
+        return shell_of(field)
+
+    monkeypatch.setattr(deployment, "_SHELLS", {})
+    monkeypatch.setattr(deployment, "paint", baking)
+    monkeypatch.setattr(deployment, "shell_of", laying_out)
     monkeypatch.setattr(
         deployment,
         "make_environment",
@@ -103,7 +109,7 @@ def test_a_look_is_built_in_once(monkeypatch):
     target.open([PosedField(field)])
     field.set_parameter("density", field.parameters()["density"].numpy() / 2)
     target.open([PosedField(field)])
-    assert len(baked) == 3
+    assert len(baked) == 3 and len(laid_out) == 2  # of two densities
     images = [item.image for (item,) in opened]
     assert np.array_equal(images[0], images[3])
     assert not np.array_equal(images[0], images[2])
@@ -115,3 +121,8 @@ def test_a_look_is_built_in_once(monkeypatch):
         field.set_parameter("texture", texture)
         target.open([PosedField(field)])
     assert len(deployment._BUILT[field]) == 4
+    before = len(laid_out)
+    target.open([PosedField(homogeneous(400.0)), PosedField(homogeneous(400.0))])
+    assert len(laid_out) == before  # such a field was there
+    target.open([PosedField(homogeneous(300.0)), PosedField(homogeneous(300.0))])
+    assert len(laid_out) == before + 1
