@@ -126,7 +126,8 @@ def _title(parts: Parts) -> str:
     names = [run.document["scenario"]["name"] for run in parts.runs]
     groups = parts.sweeps, parts.transfers, parts.retrainings
     for word, group in zip(("sweep", "transfer", "retraining"), groups, strict=True):
-        names += [f"{word} {part.label}" for part in group]
+        labels = [part.label for part in group]
+        names += [x if x.startswith(word) else f"{word} {x}" for x in labels]
     names = list(dict.fromkeys(names))
     return ", ".join(names) if len(names) < 4 else f"{len(names)} results"
 

@@ -224,6 +224,12 @@ def test_deployments_part_what_was_measured_in_them():
     assert grouped(runs, deployed=False) == [["a", "b"]]
 
 
+def test_a_title_says_no_word_twice(tmp_path, page_of):
+    make_transfer(tmp_path / "transfer")
+    page, _ = page_of("transfer")
+    assert "<title>transfer</title>" in page
+
+
 def test_transfers_and_retrainings_are_tables(tmp_path, page_of):
     make_transfer(tmp_path / "moved")
     make_retraining(tmp_path / "better-retrain.json")
