@@ -29,6 +29,7 @@ from bench.studies.content import (
     interval_words,
     metres,
 )
+from bench.studies.light import light
 from bench.studies.limits import limits
 from bench.studies.plan import Study, state
 from bench.studies.transfer import transfer
@@ -329,6 +330,7 @@ FINDINGS: dict[str, tuple[str, Callable[[pd.DataFrame], Finding]]] = {
     "searches": ("which search by gradient is best", searches),
     "flat": ("whether flat objects mislead the policy", flat),
     "transfer": ("whether attacks transfer", transfer),
+    "light": ("whether attacks survive other light and wheels", light),
     "limits": ("what limits attacks", limits),
 }
 

@@ -185,6 +185,38 @@ def test_transfer_counts_places_not_attacks():
     ]
 
 
+def light_rows(methods, where):
+    """Return drives at five places: an environment's share of the surrogate's error."""
+    return pd.DataFrame(
+        {"attack": f"left-cars-{method}-{seed}-0", "route": "left", "case": case}
+        | {"environment": environment, "condition": condition}
+        | {"cross_track_mean_m": error * size * share * (1 + seed / 1e3 * (size > 1))}
+        for method, size in methods.items()
+        for (environment, condition), share in where.items()
+        for seed in range(5)
+        for case, error in (("attack", 0.1 + seed), ("no_object", 9.0))
+    )
+
+
+def test_light_counts_aims_and_where_varying_helps():
+    where = {("surrogate", "day"): 1.0, ("mitsuba", "day"): 0.88}
+    where |= {("mujoco_built_in", "day"): 0.72, ("mitsuba", "evening"): 0.59}
+    rows = light_rows({"plain": 1.0, "vary": 2.0}, where)
+    found = made("light", rows)
+    assert "in 1 of 3 environments and conditions; `vary` helps in 3" in found.title
+    assert "10 attacks at 5 places" in found.sentences[2]
+    by_place = {tuple(row[:2]): row[2:5] for row in found.rows}
+    assert by_place == {
+        ("mitsuba", "day"): ["0.88", "0.90", "0.88"],
+        ("mujoco_built_in", "day"): ["0.72", "0.70", "0.72"],
+        ("mitsuba", "evening"): ["0.59", "0.60", "0.59"],
+    }
+    assert {row[5] for row in found.rows} == {"2.00 to 2.01"}
+    alone = made("light", rows[rows["attack"].str.contains("vary")])
+    assert "`vary` helps in 0" in alone.title
+    assert {row[5] for row in alone.rows} == {"–"}
+
+
 def test_limits_counts_places_beyond_the_lane():
     rows = [
         {"place": f"{route}-{kind}-{seed}", "pixels": 10, "moved": 0.1 * number}

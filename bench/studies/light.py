@@ -1,0 +1,90 @@
+"""The finding about `vary`: what attacks keep in other light and other vehicles."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+
+from bench.studies.charts import draw_heat
+from bench.studies.content import ERROR, Finding, ends_cell
+from mi_nerfattack.evaluation.summary import Interval, interval
+from mi_nerfattack.rollout.drive import ATTACK
+from mi_nerfattack.scenario.deployment import SURROGATE
+
+PLAIN, VARY = "plain", "vary"
+_OTHER_LIGHT = 0.6  # is the aim where it is not day
+#: Aims by day, of bench/light.toml: shares of the surrogate's error.
+AIMS = {
+    "mitsuba": 0.9,
+    "mujoco": 0.85,
+    "mitsuba_built_in": 0.7,
+    "mujoco_built_in": 0.7,
+}
+
+
+def light(drives: pd.DataFrame) -> Finding:
+    """Compare attacks with and without `vary`, in each environment and condition."""
+    logs = _errors(drives).map(math.log)
+    kept = logs.sub(logs[SURROGATE, "day"], axis=0).drop(
+        columns=(SURROGATE, "day"), errors="ignore"
+    )
+    ratios = kept.groupby("method").mean().map(math.exp)
+    gains = _gains(logs)
+    rows, met, helps = [], 0, 0
+    for place in kept.columns:
+        environment, condition = place
+        aim = AIMS[environment] if condition == "day" else _OTHER_LIGHT
+        own = {name: ratios[place].get(name) for name in (PLAIN, VARY)}
+        met += own[VARY] is not None and own[VARY] >= aim
+        ends = gains.get(place)
+        helps += ends is not None and ends[0] > 1
+        cells = ["–" if x is None else f"{x:.2f}" for x in (own[VARY], aim, own[PLAIN])]
+        rows.append([environment, condition, *cells, ends_cell(ends, 2)])
+    count = len(kept.columns)
+    heat = ratios.reindex([VARY]).loc[VARY].unstack(sort=False)
+    places = len(logs.groupby(["route", "seed"]))
+    return Finding(
+        f"With `vary`, attacks keep the wanted share of their error in {met} of "
+        f"{count} environments and conditions; `vary` helps in {helps}",
+        (
+            "The share is the geometric mean of the error with the attack, divided by "
+            "the error in the surrogate by day.",
+            "`vary` helps where the 95 % interval of the ratio of its error to that of "
+            "`plain` lies above 1.",
+            f"The rows are of {drives['attack'].nunique()} attacks at {places} places, "
+            "with one start each.",
+        ),
+        [
+            *("environment", "condition", "`vary` keeps", "aim", "`plain` keeps"),
+            "error of `vary` to `plain`, 95 % interval",
+        ],
+        rows,
+        lambda figure: draw_heat(figure, heat),
+        "own = drives.query(\"case == 'attack'\")\n"
+        'print(own.pivot_table("cross_track_mean_m", "environment", "condition"))',
+    )
+
+
+def _errors(drives: pd.DataFrame) -> pd.DataFrame:
+    """Return errors with the attack by method, route and seed, and where it drives."""
+    own = drives[drives["case"] == ATTACK]
+    # Names of attacks end with the method, the seed of the place and a digest
+    parts = own["attack"].str.split("-")
+    own = own.assign(method=parts.str[-3], seed=parts.str[-2])
+    rows, columns = ["method", "route", "seed"], ["environment", "condition"]
+    return own.pivot_table(ERROR, rows, columns, sort=False)
+
+
+def _gains(logs: pd.DataFrame) -> dict[tuple[str, str], Interval]:
+    """Return the interval of the ratio of `vary` to `plain`, paired by place."""
+    methods = set(logs.index.get_level_values("method"))
+    if not {PLAIN, VARY} <= methods:
+        return {}
+    pairs = (logs.loc[VARY] - logs.loc[PLAIN]).dropna()
+    found = {place: interval(np.mean, (pairs[place].to_numpy(),), 0) for place in pairs}
+    return {
+        place: None if ends is None else np.exp(ends).tolist()
+        for place, ends in found.items()
+    }
