@@ -325,7 +325,9 @@ def transfer_sections(drives: pd.DataFrame) -> Iterator[str]:
     day = {(r["attack"], r["environment"]): r for r in rows if r["condition"] == "day"}
     there = list(dict.fromkeys(name for _, name in day))
     labels = drives["attack"].unique()
-    lines = ((label, *(_error(day[label, name]) for name in there)) for label in labels)
+    lines = (
+        (label, *(_error(day.get((label, name))) for name in there)) for label in labels
+    )
     text = "Mean error with each attack by day, metres; bold where it succeeds."
     yield f"## Attacks\n\n{text}\n\n{markdown_table(['attack', *there], lines)}"
 
@@ -338,14 +340,16 @@ def _column(column: Mapping[str, Any]) -> Sequence[str]:
     ratio = column["ratio_to_surrogate"]
     return (
         column["condition"],
-        f"{cases[NO_OBJECT]['cross_track_mean_m']:.3f}",
-        cell(cases[ATTACK]),
-        out(cases[ATTACK]),
+        cell(cases.get(NO_OBJECT), NO_OBJECT),
+        cell(cases.get(ATTACK)),
+        out(cases[ATTACK]) if ATTACK in cases else "",
         "" if ratio is None else f"{ratio:.2f}",
         kept,
     )
 
 
-def _error(row: Mapping[str, Any]) -> str:
+def _error(row: Mapping[str, Any] | None) -> str:
+    if row is None or ATTACK not in row["cases"]:
+        return ""
     told = f"{row['cases'][ATTACK]['cross_track_mean_m']:.3f}"
     return f"**{told}**" if row["succeeds"] else told

@@ -91,6 +91,18 @@ def test_a_transfer_leaves_a_table_of_which_its_page_is_written_again(tmp_path):
     assert page.read_text() == text
 
 
+@pytest.mark.parametrize("left", ["no_object", "attack"])
+def test_a_case_that_is_not_driven_leaves_its_cells_empty(left, tmp_path):
+    found = document("b")
+    for row in found["rows"]:
+        row["cases"] = {k: v for k, v in row["cases"].items() if k != left}
+    files.write_json(tmp_path / "transfer.json", found)
+    page = tmp_path / "README.md"
+    assert cli.main(["report", str(tmp_path), "-o", str(page)]) == 0
+    cells = "|  | 0.400 | 1 of 1 |" if left == "no_object" else "| 0.400 |  |  |"
+    assert f"| day {cells}" in page.read_text()
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_budgets_have_the_attacks_of_table_2():
