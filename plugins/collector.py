@@ -35,16 +35,17 @@ class RayCollector:
         self._parts = composite, list(posed), stop
         self._wanted: tuple[int, ...] = ()
         self._frozen = freeze_method(self._accumulate, self._state)
-        self._queue = TaskQueue(self._launch)
+        self._queue = TaskQueue()
         self._by_rays = freeze_method(self._march_back, self._rays_state)
 
     def add(self, rays: Rays, seen: Seen, cotangent: Seen) -> None:
         """Take rays; see :meth:`AbstractComposite.backward`."""
         composite, posed, _ = self._parts
         for task in composite.tasks(posed, rays, seen, cotangent):
-            self._queue.add(task)
+            for ready in self._queue.add(task):
+                self._launch(ready)
         if not self.waits:
-            self._queue.finish()
+            self.finish()
 
     def by_rays(
         self, rays: Rays, seen: Seen, cotangent: Seen, wanted: Sequence[int]
@@ -74,7 +75,8 @@ class RayCollector:
 
     def finish(self) -> None:
         """March the rays that wait."""
-        self._queue.finish()
+        for task in self._queue.finish():
+            self._launch(task)
 
     def _launch(self, task: Task) -> None:
         once = self._has_backdrop(task.fields)

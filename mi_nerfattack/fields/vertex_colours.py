@@ -7,6 +7,7 @@ before, nor should it unpack a gradient once a frame.
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -44,7 +45,7 @@ class VertexColours:
     """
 
     def __init__(self, field: GridField) -> None:
-        self.field = field
+        self._field = weakref.ref(field)  # which has this object
         level = field.levels()[-1]
         self._start: int = level.vertices.start
         index = dr.arange(mi.UInt32, level.resolution**3)
@@ -56,6 +57,13 @@ class VertexColours:
         self._others, self._summed = mi.Float(0), mi.Float(0)
         self.value: mi.TensorXf = mi.TensorXf()
         self.read()
+
+    @property
+    def field(self) -> GridField:
+        """The field whose colours they are."""
+        field = self._field()
+        assert field is not None, "colours outlive their field"
+        return field
 
     def read(self) -> None:
         """Take the colours from the field's texture, which has been replaced.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
@@ -250,35 +250,31 @@ class TaskQueue:
     """Tasks that wait until there are rays enough for a launch.
 
     A launch goes over the whole buffer of gradients, however few its rays are.
-
-    Args:
-        run: does a task.
     """
 
-    def __init__(self, run: Callable[[Task], None]) -> None:
-        self._run = run
+    def __init__(self) -> None:
         self._waiting: dict[tuple[int, ...], list[Task]] = {}
 
-    def add(self, task: Task) -> None:
-        """Let a task wait, or do it with those that wait for the same fields."""
+    def add(self, task: Task) -> Iterator[Task]:
+        """Let a task wait, or yield it with those that wait for the same fields."""
         dr.eval(task)  # or it holds all rays of its image
         waiting = self._waiting.setdefault(task.fields, [])
         waiting.append(task)
         if sum(one.size for one in waiting) >= FIRST_RAYS:
-            self._launch(task.fields)
+            yield self._joined(task.fields)
 
-    def finish(self) -> None:
-        """Do all that wait."""
+    def finish(self) -> Iterator[Task]:
+        """Yield all that wait, a task for each set of fields."""
         for which in list(self._waiting):
-            self._launch(which)
+            yield self._joined(which)
 
     def clear(self) -> None:
         """Forget all that wait."""
         self._waiting.clear()
 
-    def _launch(self, which: tuple[int, ...]) -> None:
+    def _joined(self, which: tuple[int, ...]) -> Task:
         tasks = self._waiting.pop(which)
-        self._run(concat(tasks, [task.size for task in tasks]))
+        return concat(tasks, [task.size for task in tasks])
 
 
 def select(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import weakref
 from dataclasses import replace
 
 import drjit as dr
@@ -288,6 +289,22 @@ def test_what_is_kept_gives_the_same_image_again():
     for one, other in zip(seen.kept.seen.layers, again.kept.seen.layers, strict=True):
         for name in ("radiance", "opacity", "moment"):
             assert dr.all(getattr(one, name) == getattr(other, name), axis=None)
+
+
+def test_fields_die_with_their_last_reference():
+    """Else a process that opens one world after another keeps gigabytes of them."""
+    gc.collect()
+    gc.disable()
+    try:
+        loop, _ = toy.make_loop()
+        gradient(make_rollout(loop, 1, adjoint="kept"))
+        alive = [weakref.ref(field) for field in loop.sensor.fields]
+        assert alive and all(reference() is not None for reference in alive)
+        loop.sensor.fields[0].colours.read()
+        del loop, _
+        assert [reference() for reference in alive] == [None] * len(alive)
+    finally:
+        gc.enable()
 
 
 def test_sensors_die_safely_while_others_record():
