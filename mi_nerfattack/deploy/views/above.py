@@ -52,7 +52,7 @@ class PixelRays:
 
     def _state(self, origin: mi.Point3f, columns: Any) -> list[Any]:
         del origin, columns
-        return [self, self.camera]
+        return [self.camera]
 
 
 #: What is higher is left out of the surrogate's picture, metres: from where no view

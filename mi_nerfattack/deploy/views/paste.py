@@ -94,7 +94,7 @@ class Paster:
 
     def _state(self, rays: Rays) -> list[Any]:
         states = [posed.state() for posed in self.objects]
-        return [self, dr.width(rays.direction), states]
+        return [dr.width(rays.direction), states]
 
 
 def require_fields(objects: Sequence[Any]) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 from support.faults.refusals import refusals
@@ -141,3 +144,16 @@ test_bad_input = refusals(
     (paste(from_fov(8, 6, 60.0)), "frame: image .12, 16, 3.*6 x 8 pixels"),
     (paste(make=homogeneous), "objects: GridField"),
 )
+
+
+def test_objects_die_with_their_paster():
+    gc.collect()
+    gc.disable()
+    try:
+        thing = posed(30.0)
+        paster, alive = Paster(CAMERA, [thing]), weakref.ref(thing.field)
+        paster.paste(frame_at(AHEAD, np.inf))
+        del thing, paster
+        assert alive() is None
+    finally:
+        gc.enable()
