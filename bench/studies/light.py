@@ -10,7 +10,7 @@ import pandas as pd
 from bench.studies.charts import draw_heat
 from bench.studies.content import ERROR, Finding, ends_cell
 from mi_nerfattack.evaluation.summary import Interval, interval
-from mi_nerfattack.rollout.drive import ATTACK
+from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT
 from mi_nerfattack.scenario.deployment import SURROGATE
 
 PLAIN, VARY = "plain", "vary"
@@ -26,11 +26,13 @@ AIMS = {
 
 def light(drives: pd.DataFrame) -> Finding:
     """Compare attacks with and without `vary`, in each environment and condition."""
-    logs = _errors(drives).map(math.log)
-    kept = logs.sub(logs[SURROGATE, "day"], axis=0).drop(
-        columns=(SURROGATE, "day"), errors="ignore"
+    logs, without = (
+        _errors(drives, case).map(math.log) for case in (ATTACK, NO_OBJECT)
     )
+    base = logs[SURROGATE, "day"]
+    kept = logs.sub(base, axis=0).drop(columns=[(SURROGATE, "day")])
     ratios = kept.groupby("method").mean().map(math.exp)
+    bare = without.sub(base, axis=0).groupby("method").mean().map(math.exp)
     gains = _gains(logs)
     rows, met, helps = [], 0, 0
     for place in kept.columns:
@@ -40,9 +42,11 @@ def light(drives: pd.DataFrame) -> Finding:
         met += own[VARY] is not None and own[VARY] >= aim
         ends = gains.get(place)
         helps += ends is not None and ends[0] > 1
-        cells = ["–" if x is None else f"{x:.2f}" for x in (own[VARY], aim, own[PLAIN])]
+        figures = own[VARY], aim, bare[place].get(VARY), own[PLAIN]
+        cells = ["–" if x is None else f"{x:.2f}" for x in figures]
         rows.append([environment, condition, *cells, ends_cell(ends, 2)])
-    count = len(kept.columns)
+    count, (environment, condition) = len(kept.columns), ratios.loc[VARY].idxmin()
+    least = f"{ratios.loc[VARY].min():.2f}, in `{environment}`, {condition}"
     heat = ratios.reindex([VARY]).loc[VARY].unstack(sort=False)
     places = len(logs.groupby(["route", "seed"]))
     return Finding(
@@ -50,14 +54,15 @@ def light(drives: pd.DataFrame) -> Finding:
         f"{count} environments and conditions; `vary` helps in {helps}",
         (
             "The share is the geometric mean of the error with the attack, divided by "
-            "the error in the surrogate by day.",
+            f"the error in the surrogate by day; the least share is {least}.",
             "`vary` helps where the 95 % interval of the ratio of its error to that of "
             "`plain` lies above 1.",
             f"The rows are of {drives['attack'].nunique()} attacks at {places} places, "
             "with one start each.",
         ),
         [
-            *("environment", "condition", "`vary` keeps", "aim", "`plain` keeps"),
+            *("environment", "condition", "`vary` keeps", "aim", "without objects"),
+            "`plain` keeps",
             "error of `vary` to `plain`, 95 % interval",
         ],
         rows,
@@ -67,9 +72,9 @@ def light(drives: pd.DataFrame) -> Finding:
     )
 
 
-def _errors(drives: pd.DataFrame) -> pd.DataFrame:
-    """Return errors with the attack by method, route and seed, and where it drives."""
-    own = drives[drives["case"] == ATTACK]
+def _errors(drives: pd.DataFrame, case: str) -> pd.DataFrame:
+    """Return errors of a case by method, route and seed, and where it drives."""
+    own = drives[drives["case"] == case]
     # Names of attacks end with the method, the seed of the place and a digest
     parts = own["attack"].str.split("-")
     own = own.assign(method=parts.str[-3], seed=parts.str[-2])

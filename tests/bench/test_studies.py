@@ -194,7 +194,7 @@ def light_rows(methods, where):
         for method, size in methods.items()
         for (environment, condition), share in where.items()
         for seed in range(5)
-        for case, error in (("attack", 0.1 + seed), ("no_object", 9.0))
+        for case, error in (("attack", 0.1 + seed), ("no_object", (0.1 + seed) / 4))
     )
 
 
@@ -204,17 +204,18 @@ def test_light_counts_aims_and_where_varying_helps():
     rows = light_rows({"plain": 1.0, "vary": 2.0}, where)
     found = made("light", rows)
     assert "in 1 of 3 environments and conditions; `vary` helps in 3" in found.title
+    assert "least share is 0.59, in `mitsuba`, evening" in found.sentences[0]
     assert "10 attacks at 5 places" in found.sentences[2]
-    by_place = {tuple(row[:2]): row[2:5] for row in found.rows}
+    by_place = {tuple(row[:2]): row[2:6] for row in found.rows}
     assert by_place == {
-        ("mitsuba", "day"): ["0.88", "0.90", "0.88"],
-        ("mujoco_built_in", "day"): ["0.72", "0.70", "0.72"],
-        ("mitsuba", "evening"): ["0.59", "0.60", "0.59"],
+        ("mitsuba", "day"): ["0.88", "0.90", "0.22", "0.88"],
+        ("mujoco_built_in", "day"): ["0.72", "0.70", "0.18", "0.72"],
+        ("mitsuba", "evening"): ["0.59", "0.60", "0.15", "0.59"],
     }
-    assert {row[5] for row in found.rows} == {"2.00 to 2.01"}
+    assert {row[6] for row in found.rows} == {"2.00 to 2.01"}
     alone = made("light", rows[rows["attack"].str.contains("vary")])
     assert "`vary` helps in 0" in alone.title
-    assert {row[5] for row in alone.rows} == {"–"}
+    assert {row[6] for row in alone.rows} == {"–"}
 
 
 def test_limits_counts_places_beyond_the_lane():

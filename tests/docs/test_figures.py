@@ -11,6 +11,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from bench.studies.light import light
 from mi_nerfattack.experiment.sweep.table import read_table
 from mi_nerfattack.io import files
 
@@ -143,6 +144,15 @@ def test_patches_of_two_resolutions_equal_their_rows(name, pixels):
         left, count = lit[lit["case"] == "attack"]["departed"].agg(["sum", "count"])
         assert f"the scene lights, {left} of {count} drives left the lane" in words
         assert not rows[rows["case"] == "random"]["departed"].any()
+
+
+def test_what_varied_attacks_keep_equals_their_rows():
+    rows = light(pd.read_csv(ROOT / "bench/light_transfer/drives.csv")).rows
+    kept = {row[0]: row[2] for row in rows if row[1] == "day"}
+    text = " ".join((ROOT / "docs/howto/robust.md").read_text("utf-8").split())
+    scene, car = kept["mitsuba_built_in"], kept["mujoco_built_in"]
+    assert f"kept {scene} of their error when the path-traced scene lit" in text
+    assert f"but only {car} with MuJoCo's car there" in text
 
 
 def test_the_table_of_coarse_colours_equals_its_rows():
