@@ -69,17 +69,33 @@ def light(drives: pd.DataFrame) -> Finding:
         lambda figure: draw_heat(figure, heat),
         "own = drives.query(\"case == 'attack'\")\n"
         'print(own.pivot_table("cross_track_mean_m", "environment", "condition"))',
+        (_stayed(drives, kept),),
     )
 
 
-def _errors(drives: pd.DataFrame, case: str) -> pd.DataFrame:
-    """Return errors of a case by method, route and seed, and where it drives."""
+def _stayed(drives: pd.DataFrame, kept: pd.DataFrame) -> str:
+    """Say how much of the least share by day is due to cars that stay in their lane."""
+    by_day = kept.loc[VARY].xs("day", axis=1, level="condition")
+    where = by_day.mean().idxmin()
+    out = _errors(drives, ATTACK, "departed").loc[VARY].astype(bool)
+    left, there = out[SURROGATE, "day"], out[where, "day"]
+    stays = left & ~there
+    others = math.exp(by_day[where][~stays].mean())
+    return (
+        f"Drives in or out of the lane decide about the mean: in `{where}` by day, "
+        f"{stays.sum()} of the {left.sum()} cars stay in the lane that leave it in the "
+        f"surrogate. At the other {(~stays).sum()} places, the share is {others:.2f}."
+    )
+
+
+def _errors(drives: pd.DataFrame, case: str, value: str = ERROR) -> pd.DataFrame:
+    """Return a value of a case by method, route and seed, and where it drives."""
     own = drives[drives["case"] == case]
     # Names of attacks end with the method, the seed of the place and a digest
     parts = own["attack"].str.split("-")
     own = own.assign(method=parts.str[-3], seed=parts.str[-2])
     rows, columns = ["method", "route", "seed"], ["environment", "condition"]
-    return own.pivot_table(ERROR, rows, columns, sort=False)
+    return own.pivot_table(value, rows, columns, sort=False)
 
 
 def _gains(logs: pd.DataFrame) -> dict[tuple[str, str], Interval]:

@@ -191,6 +191,7 @@ def light_rows(methods, where):
         {"attack": f"left-cars-{method}-{seed}-0", "route": "left", "case": case}
         | {"environment": environment, "condition": condition}
         | {"cross_track_mean_m": error * size * share * (1 + seed / 1e3 * (size > 1))}
+        | {"departed": share > 0.8 and seed > 2}
         for method, size in methods.items()
         for (environment, condition), share in where.items()
         for seed in range(5)
@@ -213,6 +214,9 @@ def test_light_counts_aims_and_where_varying_helps():
         ("mitsuba", "evening"): ["0.59", "0.60", "0.15", "0.59"],
     }
     assert {row[6] for row in found.rows} == {"2.00 to 2.01"}
+    (threat,) = found.threats
+    assert "in `mujoco_built_in` by day, 2 of the 2 cars stay" in threat
+    assert "At the other 3 places, the share is 0.72." in threat
     alone = made("light", rows[rows["attack"].str.contains("vary")])
     assert "`vary` helps in 0" in alone.title
     assert {row[6] for row in alone.rows} == {"–"}
