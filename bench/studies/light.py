@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,6 +15,8 @@ from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT
 from mi_nerfattack.scenario.deployment import SURROGATE
 
 PLAIN, VARY = "plain", "vary"
+#: An environment and a condition.
+Where = tuple[str, str]
 _OTHER_LIGHT = 0.6  # is the aim where it is not day
 #: Aims by day, of bench/light.toml: shares of the surrogate's error.
 AIMS = {
@@ -31,23 +34,22 @@ def light(drives: pd.DataFrame) -> Finding:
     )
     base = logs[SURROGATE, "day"]
     kept = logs.sub(base, axis=0).drop(columns=[(SURROGATE, "day")])
-    ratios = kept.groupby("method").mean().map(math.exp)
-    bare = without.sub(base, axis=0).groupby("method").mean().map(math.exp)
-    gains = _gains(logs)
+    shares, of_plain = _means(kept, VARY), _means(kept, PLAIN)
+    bare, gains = _means(without.sub(base, axis=0), VARY), _gains(logs)
     rows, met, helps = [], 0, 0
-    for place in kept.columns:
+    for place, share in shares.items():
         environment, condition = place
         aim = AIMS[environment] if condition == "day" else _OTHER_LIGHT
-        own = {name: ratios[place].get(name) for name in (PLAIN, VARY)}
-        met += own[VARY] is not None and own[VARY] >= aim
+        met += share >= aim
         ends = gains.get(place)
         helps += ends is not None and ends[0] > 1
-        figures = own[VARY], aim, bare[place].get(VARY), own[PLAIN]
+        figures = share, aim, bare.get(place), of_plain.get(place)
         cells = ["–" if x is None else f"{x:.2f}" for x in figures]
         rows.append([environment, condition, *cells, ends_cell(ends, 2)])
-    count, (environment, condition) = len(kept.columns), ratios.loc[VARY].idxmin()
-    least = f"{ratios.loc[VARY].min():.2f}, in `{environment}`, {condition}"
-    heat = ratios.reindex([VARY]).loc[VARY].unstack(sort=False)
+    environment, condition = min(shares, key=lambda place: shares[place])
+    least = f"{min(shares.values()):.2f}, in `{environment}`, {condition}"
+    heat: Any = pd.Series(shares).unstack(sort=False)
+    count = len(shares)
     places = len(logs.groupby(["route", "seed"]))
     return Finding(
         f"With `vary`, attacks keep the wanted share of their error in {met} of "
@@ -75,7 +77,7 @@ def light(drives: pd.DataFrame) -> Finding:
 
 def _stayed(drives: pd.DataFrame, kept: pd.DataFrame) -> str:
     """Say how much of the least share by day is due to cars that stay in their lane."""
-    by_day = kept.loc[VARY].xs("day", axis=1, level="condition")
+    by_day: Any = kept.loc[VARY].xs("day", axis=1, level="condition")
     where = by_day.mean().idxmin()
     out = _errors(drives, ATTACK, "departed").loc[VARY].astype(bool)
     left, there = out[SURROGATE, "day"], out[where, "day"]
@@ -98,14 +100,22 @@ def _errors(drives: pd.DataFrame, case: str, value: str = ERROR) -> pd.DataFrame
     return own.pivot_table(value, rows, columns, sort=False)
 
 
-def _gains(logs: pd.DataFrame) -> dict[tuple[str, str], Interval]:
+def _means(logs: pd.DataFrame, method: str) -> dict[Where, float]:
+    """Return the geometric means of a method over its places; none without any."""
+    if method not in logs.index.get_level_values("method"):
+        return {}
+    means: Any = logs.loc[method].mean().items()
+    return {place: math.exp(mean) for place, mean in means}
+
+
+def _gains(logs: pd.DataFrame) -> dict[Where, Interval]:
     """Return the interval of the ratio of `vary` to `plain`, paired by place."""
     methods = set(logs.index.get_level_values("method"))
     if not {PLAIN, VARY} <= methods:
         return {}
-    pairs = (logs.loc[VARY] - logs.loc[PLAIN]).dropna()
-    found = {place: interval(np.mean, (pairs[place].to_numpy(),), 0) for place in pairs}
-    return {
-        place: None if ends is None else np.exp(ends).tolist()
-        for place, ends in found.items()
-    }
+    pairs, found = (logs.loc[VARY] - logs.loc[PLAIN]).dropna(), {}
+    columns: Any = pairs.items()
+    for place, logarithms in columns:
+        ends = interval(np.mean, (logarithms.to_numpy(),), 0)
+        found[place] = None if ends is None else np.exp(ends).tolist()
+    return found
