@@ -77,9 +77,10 @@ def light(drives: pd.DataFrame) -> Finding:
 
 def _stayed(drives: pd.DataFrame, kept: pd.DataFrame) -> str:
     """Say how much of the least share by day is due to cars that stay in their lane."""
-    by_day: Any = kept.loc[VARY].xs("day", axis=1, level="condition")
+    own: Any = kept.loc[VARY]
+    by_day = own.xs("day", axis=1, level="condition")
     where = by_day.mean().idxmin()
-    out = _errors(drives, ATTACK, "departed").loc[VARY].astype(bool)
+    out: Any = _errors(drives, ATTACK, "departed").loc[VARY].astype(bool)
     left, there = out[SURROGATE, "day"], out[where, "day"]
     stays = left & ~there
     others = math.exp(by_day[where][~stays].mean())
@@ -104,8 +105,8 @@ def _means(logs: pd.DataFrame, method: str) -> dict[Where, float]:
     """Return the geometric means of a method over its places; none without any."""
     if method not in logs.index.get_level_values("method"):
         return {}
-    means: Any = logs.loc[method].mean().items()
-    return {place: math.exp(mean) for place, mean in means}
+    own: Any = logs.loc[method]
+    return {place: math.exp(mean) for place, mean in own.mean().items()}
 
 
 def _gains(logs: pd.DataFrame) -> dict[Where, Interval]:
