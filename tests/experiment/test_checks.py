@@ -7,7 +7,6 @@ import json
 import re
 import shlex
 import shutil
-from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -18,7 +17,6 @@ from support.worlds.fields import homogeneous
 
 from mi_nerfattack import cli
 from mi_nerfattack.attack.base import Freedom
-from mi_nerfattack.backend.arrays import allocated_bytes
 from mi_nerfattack.deploy.environment import CameraFrame
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment import job as module
@@ -27,7 +25,7 @@ from mi_nerfattack.experiment.checks.before_attack import (
     likeness_findings,
 )
 from mi_nerfattack.experiment.checks.check import duration
-from mi_nerfattack.experiment.checks.cost import kept_mb, planned_periods
+from mi_nerfattack.experiment.checks.cost import planned_periods
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov, mount_matrix
 from mi_nerfattack.render.camera.pose import Pose
@@ -37,10 +35,7 @@ from mi_nerfattack.render.pathtrace.ground import (
     wall_findings,
 )
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.rollout.adjoint import KeptBackgrounds
-from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.scenario.scenario import DriveSection, load_scenario
-from mi_nerfattack.scenario.world import build_world
 from mi_nerfattack.vehicle.route.route import Route
 
 pytestmark = pytest.mark.usefixtures("variant", "no_results")
@@ -316,21 +311,6 @@ def test_a_sound_scenario(scenario_folder, capsys):
     # 3 iterations there and back, 4 cases of 2 drives and the looks in both worlds
     scenario, _ = load_scenario(scenario_folder / "changed.toml")
     assert planned_periods(scenario) == 4 * (2 * 3 + 2 * (4 * 2 + 2))
-
-
-def test_the_memory_of_kept_frames_is_told(scenario_folder):
-    """It is what an iteration's drive keeps, but for the frames that are timed."""
-    path = scenario_folder / "scenario.toml"
-    options = ["drive.horizon=30", "attack.adjoint.kind=kept_backgrounds"]
-    scenario, _ = load_scenario(path, settings=options)
-    world = build_world(scenario, scenario.build_policy())
-    loop = world.loop(world.optimised)
-    rollout = Rollout(loop, world.objective, 30, adjoint=KeptBackgrounds())
-    kept = rollout.run(loop.initial(world.initial[:1])).trajectory.kept
-    truth = sum(allocated_bytes(seen) for seen, _ in kept) / 1e6
-    assert kept_mb(world) == pytest.approx(truth * 24 / 30, rel=0.3)
-    other, _ = load_scenario(path, settings=["attack.adjoint.kind=replay"])
-    assert kept_mb(replace(world, scenario=other)) == 0
 
 
 def test_the_next_command_can_be_given_as_it_is_told(scenario_folder, capsys):

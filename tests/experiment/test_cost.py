@@ -1,0 +1,31 @@
+"""What an attack would cost, against what it keeps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from mi_nerfattack.backend.arrays import allocated_bytes
+from mi_nerfattack.experiment.checks.cost import kept_mb
+from mi_nerfattack.rollout.adjoint import KeptBackgrounds
+from mi_nerfattack.rollout.function import Rollout
+from mi_nerfattack.scenario.scenario import load_scenario
+from mi_nerfattack.scenario.world import build_world
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def test_the_memory_of_kept_frames_is_told(scenario_folder):
+    """It is what an iteration's drive keeps, but for the frames that are timed."""
+    path = scenario_folder / "scenario.toml"
+    options = ["drive.horizon=30", "attack.adjoint.kind=kept_backgrounds"]
+    scenario, _ = load_scenario(path, settings=options)
+    world = build_world(scenario, scenario.build_policy())
+    loop = world.loop(world.optimised)
+    rollout = Rollout(loop, world.objective, 30, adjoint=KeptBackgrounds())
+    kept = rollout.run(loop.initial(world.initial[:1])).trajectory.kept
+    truth = sum(allocated_bytes(seen) for seen, _ in kept) / 1e6
+    assert kept_mb(world) == pytest.approx(truth * 24 / 30, rel=0.3)
+    other, _ = load_scenario(path, settings=["attack.adjoint.kind=replay"])
+    assert kept_mb(replace(world, scenario=other)) == 0
