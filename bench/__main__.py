@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 
+from bench.accuracy import BenchAccuracy
 from bench.attack.bench import BenchAttack
 from bench.attack.scaling import BenchScaling
 from bench.capture import BenchGaps, BenchPoses
@@ -15,6 +16,7 @@ from bench.render.bench import BenchRender
 from bench.roughness import BenchRoughness
 from bench.splats import BenchSplats
 from bench.studies.run import BenchResults
+from bench.vary import BenchVary
 from mi_nerfattack import cli
 
 COMMANDS = {
@@ -24,6 +26,8 @@ COMMANDS = {
     "scaling": BenchScaling,
     "loop": BenchLoop,
     "splats": BenchSplats,
+    "accuracy": BenchAccuracy,
+    "vary": BenchVary,
     "roughness": BenchRoughness,
     "reach": BenchReach,
     "poses": BenchPoses,

@@ -25,6 +25,7 @@ from mi_nerfattack.fit.scores import FieldRenderer, compare, reference
 from mi_nerfattack.io import files
 
 TRANSFORMS = "transforms.json"
+FIGURES = "figures.json"
 PLACED, ROTATION_DEG, POSITION = 0.96, 1.0, 0.01  # least share, and most
 
 
@@ -78,6 +79,7 @@ class BenchPoses:
             and document["rotation_deg"] <= ROTATION_DEG
             and document["position_share"] <= POSITION
         )
+        files.write_json(work / FIGURES, document)
         rows = [(name, f"{value:.5g}") for name, value in document.items()]
         table = markdown(("figure", "value"), rows)
         return Result(document, lambda: print(table), int(not good))
@@ -111,6 +113,7 @@ class BenchGaps:
         check_positive(self, "steps", "long_edge")
         files.make_folder(self.output)
         found = [thinned(self, every) for every in self.every]
+        files.write_json(self.output / FIGURES, {"rows": found})
         header = (
             "fitted to",
             "PSNR of these",

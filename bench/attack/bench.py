@@ -10,7 +10,7 @@ from typing import Any
 
 from bench.attack.drive import OBJECT_POSE, Job
 from bench.ngp_data import NGPData
-from bench.results import Comparison, Progress, compare, read_sizes
+from bench.results import Comparison, Progress, compare, read_sizes, run_command
 from bench.tables import markdown, number
 from bench.torch.object import ObjectData
 from bench.worker import Worker, medians
@@ -26,6 +26,9 @@ TIMES = {
     "kept_backgrounds": "iteration, backgrounds kept",
     "one_level": "the same, objects as one level",
     "replay": "iteration, replay",
+    "bricks_rollout": "drive alone in bricks",
+    "bricks_kept_backgrounds": "iteration in bricks, backgrounds kept",
+    "bricks_one_level": "the same, objects as one level",
     "torch": "iteration, PyTorch",
 }
 HORIZON = 25  # control periods
@@ -36,8 +39,8 @@ class BenchAttack(Comparison):
     """Measure an attack iteration against a drive and against the loop in PyTorch.
 
     One drive past the bundled hydrant, both sides in turns, in processes of their own,
-    on all cores; medians count. Keep the machine otherwise idle. Takes about twenty
-    minutes.
+    on all cores; medians count. We also drive before the scene in bricks, PyTorch does
+    not. Keep the machine otherwise idle. Takes about twenty minutes.
     """
 
     repeats: int = 3
@@ -59,18 +62,21 @@ def measure(options: BenchAttack, folder: Path, show: Progress) -> dict[str, Any
     NGPData.of(field).write(scene)
     hydrant = load_grid(bundled("hydrant/field.safetensors"))
     ObjectData.of(PosedField(hydrant, OBJECT_POSE)).write(item)
+    bricks = folder / "bricks.safetensors"
+    words = ["bake", str(bundled("base.toml")), "-o", str(bricks)]
+    run_command([*words, *(["--passes", "0"] if options.quick else [])])
     horizon = 2 if options.quick else HORIZON
     sizes = read_sizes(options.sizes)
     rows: dict[str, Any] = {}
     for text, size in zip(options.sizes, sizes, strict=True):
         job = Job(*size, 1, horizon)
         peer = [str(scene), str(item), astuple(job), *[[4096]] * options.quick]
-        rows[text] = _times(job, peer, options.repeats, show)
+        rows[text] = _times(job, str(bricks), peer, options.repeats, show)
     return {"horizon": horizon, "repeats": options.repeats, "sizes": rows}
 
 
 def _times(
-    job: Job, peer: Sequence[Any], repeats: int, show: Progress
+    job: Job, bricks: str, peer: Sequence[Any], repeats: int, show: Progress
 ) -> dict[str, Any]:
     """Time drives and iterations of one vehicle, both sides in turns."""
     stage = f"time, {job.width}x{job.height}"
@@ -78,18 +84,25 @@ def _times(
     turns: dict[str, list[dict[str, float]]] = {name: [] for name in TIMES}
     with ExitStack() as stack:
         ours = stack.enter_context(Worker("attack.ours", "OurAttack", *astuple(job)))
-        for way in WAYS:  # traces and compiles
-            ours.ask("iterate", way)
+        baked = bricks, *astuple(job)
+        in_bricks = stack.enter_context(Worker("attack.ours", "in_bricks", *baked))
+        sides = [("", ours, WAYS), ("bricks_", in_bricks, WAYS[:2])]
+        for _, side, ways in sides:  # traces and compiles
+            for way in ways:
+                side.ask("iterate", way)
         theirs = stack.enter_context(Worker("attack.peer", "TorchAttack", *peer))
         for repeat in range(repeats):
-            turns["rollout"].append(ours.timed("drive"))
-            for way in WAYS:
-                turns[way].append(ours.ask("iterate", way))
+            for name, side, ways in sides:
+                turns[f"{name}rollout"].append(side.timed("drive"))
+                for way in ways:
+                    turns[f"{name}{way}"].append(side.ask("iterate", way))
             turns["torch"].append(theirs.timed("iterate"))
             show(stage, repeat + 1, repeats, "")
         row = {
             "settings": {"ours": ours.ask("facts"), "torch": theirs.ask("facts")},
-            "kernels_compiled_after_warmup": sum(ours.ask("compiled", w) for w in WAYS),
+            "kernels_compiled_after_warmup": sum(
+                side.ask("compiled", way) for _, side, ways in sides for way in ways
+            ),
             "peak_memory_mb": ours.ask("memory")["peak_memory_mb"],
             "torch_peak_memory_mb": theirs.ask("memory")["peak_memory_mb"],
         }
@@ -100,6 +113,7 @@ def _times(
         "iteration_over_rollout": kept / rollout,
         "replay_over_rollout": row["replay_seconds"] / rollout,
         "torch_time_ratio": row["torch_seconds"] / kept,
+        "torch_time_ratio_one_level": row["torch_seconds"] / row["one_level_seconds"],
         "torch_cpu_ratio": row["torch_cpu_seconds"] / row[f"{WAYS[0]}_cpu_seconds"],
     }
 

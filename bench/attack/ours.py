@@ -46,19 +46,25 @@ ADJOINTS = {
 VISIBLE = 0.01  # opacity from which a pixel counts as the object's
 
 
+def in_bricks(scene: str, *values: int) -> OurAttack:
+    """Return iterations before a background in bricks."""
+    return OurAttack(*values, scene=scene)
+
+
 class OurAttack:
     """Iterations of ours.
 
     Args:
         values: what is driven, the values of a :class:`Job`.
+        scene: field file of the background; the bundled intersection by default.
     """
 
-    def __init__(self, *values: int) -> None:
+    def __init__(self, *values: int, scene: str | None = None) -> None:
         self.job = job = Job(*values)
         hydrant = bundled("hydrant/field.safetensors")
         items = [PosedField(load_grid(hydrant), pose) for pose in job.object_poses()]
-        scene = PosedField(load_field(bundled("intersection/field.safetensors")))
-        sensor = field_sensor(scene, items, job.camera, MOUNT, stop=STOP)
+        field = load_field(scene or bundled("intersection/field.safetensors"))
+        sensor = field_sensor(PosedField(field), items, job.camera, MOUNT, stop=STOP)
         policy = TorchPolicy(network(), preprocess=Preprocess(job.transforms()))
         path = route()
         vehicle = Dubins(SPEED_MS, MAX_HEADING_RATE)

@@ -43,7 +43,7 @@ class BenchScaling:
     """Vehicles in the batch."""
     objects: tuple[Count, ...] = (1, 2, 4, 8)
     """Objects that are attacked."""
-    horizons: tuple[Count, ...] = (25, 50, 100, 200)
+    horizons: tuple[Count, ...] = (25, 50, 100, 200, 400)
     """Control periods of the same 2.5 seconds."""
     repeats: Count = 3
     """Iterations that are timed; the median counts."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -154,25 +153,6 @@ def choose(names: tuple[str, ...]) -> list[Study]:
     return [study for study in studies if not names or study.name in names]
 
 
-def wanted_labels(grid: Path) -> list[tuple[Any, ...]]:
-    """Return the labels of the cells of a grid: route, objects, method, budget, seed.
-
-    No place is drawn and no file but the grid and its scenario is read.
-    """
-    reader = GridReader(grid)
-    axes, base = reader.grid, reader.base
-    methods = [one.name for one in axes.methods] or [base.attack.method.kind]
-    rest = itertools.product(methods, axes.budgets or [None], axes.seeds)
-    return [
-        (route.name, name, *labels)
-        for (route, objects), labels in itertools.product(
-            itertools.product(axes.routes, axes.objects), list(rest)
-        )
-        if objects.routes is None or route.name in objects.routes
-        for name, _ in objects.places
-    ]
-
-
 def done_labels(table: pd.DataFrame) -> dict[tuple[Any, ...], str]:
     """Return the cell of each complete attack of a sweep's table, by its labels."""
     rows = table[table["status"] == "complete"].drop_duplicates("cell")
@@ -197,7 +177,7 @@ def state(study: Study, compare: bool = True) -> State:
         done = found if table is None else int(table[study.unit].nunique())
         done = min(done, wanted)
     else:
-        labels = wanted_labels(ROOT / study.grid)
+        labels = list(GridReader(ROOT / study.grid).labels())
         have = {} if table is None else done_labels(table)
         wanted, done = len(labels), len(have.keys() & set(labels))
         if (study.folder / MADE_OF).exists():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -219,8 +220,8 @@ def refresh(study: Study) -> None:
         write_summary(work, told_attacks(study.folder))
     names = (RESULTS, MADE_OF, SUMMARY) if study.grid else study.keep
     if names and all((work / name).exists() for name in names):
-        files.make_folder(study.folder)
         for name in names:
+            files.make_folder((study.folder / name).parent)
             if name == MADE_OF:
                 files.write_json(study.folder / name, _portable_cells(study))
                 continue
@@ -333,7 +334,15 @@ def _shown(row: dict[str, Any]) -> str:
 
 
 def _split(line: str, study: Study) -> list[str]:
-    """Return the words of a command of a study."""
+    """Return the words of a command of a study.
+
+    Raises:
+        InputError: it reads the folder of NERFATTACK_DATA, which is not set.
+    """
+    if "{data}" in line:
+        if not (data := os.environ.get("NERFATTACK_DATA")):
+            raise InputError("NERFATTACK_DATA: set it to the folder that has `fox`")
+        line = line.replace("{data}", data)
     words = shlex.split(line.replace("{work}", str(study.work)))
     return [name for word in words for name in _expanded(word)]
 

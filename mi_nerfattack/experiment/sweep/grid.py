@@ -155,28 +155,44 @@ class GridReader:
                 no place.
         """
         grid = self.grid
-        methods = grid.methods or (MethodChoice(name=self.base.attack.method.kind),)
-        budgets = grid.budgets or (None,)
         for i, j in self._places_of():
-            route, these = self._routes[i], self._objects[j]
-            for (name, place), (k, method), budget, seed in itertools.product(
-                these.places, enumerate(methods), budgets, grid.seeds
-            ):
-                layers = self._layers(i, j)
+            these = self._objects[j]
+            for (name, place), k, budget, seed in self._choices(j):
+                method, layers = self._methods[k], self._layers(i, j)
                 if these.draw is not None:
                     drawn = self._drawn(i, j, seed if place is None else place)
                     layers["objects", j, "set"] = these.set | {"objects": drawn}
                 layers["methods", k, "set"] = method.set
-                labels = route.name, name, method.name, budget, seed
+                labels = self._routes[i].name, name, method.name, budget, seed
                 multiple = method.backward_multiple
                 if multiple is None:
                     multiple = grid.backward_multiple
                 made = self._scenario(layers, seed, budget, multiple)
                 yield Cell(*labels, *made, grid.anyway, grid.pictures)
 
+    def labels(self) -> Iterator[tuple[Any, ...]]:
+        """Yield route, objects, method, budget and seed of each cell; draw no place."""
+        for i, j in self._places_of():
+            for (name, _), k, budget, seed in self._choices(j):
+                yield self._routes[i].name, name, self._methods[k].name, budget, seed
+
+    def _choices(self, objects: int) -> Iterator[tuple[Any, int, Any, int]]:
+        """Yield name and seed of a place, index of a method, budget and seed."""
+        return itertools.product(
+            self._objects[objects].places,
+            range(len(self._methods)),
+            self.grid.budgets or (None,),
+            self.grid.seeds,
+        )
+
     @functools.cached_property
     def _routes(self) -> tuple[Choice, ...]:
         return self.grid.routes or (Choice(name=axis_name(self.base.scene.route)),)
+
+    @functools.cached_property
+    def _methods(self) -> tuple[MethodChoice, ...]:
+        kind = self.base.attack.method.kind
+        return self.grid.methods or (MethodChoice(name=kind),)
 
     @functools.cached_property
     def _objects(self) -> tuple[ObjectsChoice, ...]:

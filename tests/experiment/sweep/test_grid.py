@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.sweep import grid as module
-from mi_nerfattack.experiment.sweep.grid import load_cells
+from mi_nerfattack.experiment.sweep.grid import Cell, GridReader, load_cells
 from mi_nerfattack.io.strict import parse_toml
 from mi_nerfattack.vehicle.route.route import Route
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 
+def labels_of(cells: Sequence[Cell]) -> list[tuple]:
+    return [(c.route, c.objects, c.method, c.budget, c.seed) for c in cells]
+
+
 def test_cells_are_the_product_of_the_axes(write_grid):
-    cells = load_cells(write_grid())
-    labels = [(c.route, c.objects, c.method, c.budget, c.seed) for c in cells]
+    cells = load_cells(path := write_grid())
+    labels = labels_of(cells)
+    assert list(GridReader(path).labels()) == labels
     methods = [(m, 40, seed) for m in ("gradient", "blocks") for seed in (3, 4)]
     places = [("near", "ball"), ("far", "ball"), ("far", "two")]
     assert labels == [(*place, *method) for place in places for method in methods]
@@ -42,6 +48,7 @@ def test_a_grid_of_a_scenario_alone_and_the_example_of_the_guide(
     path = scenario_folder / "alone.toml"
     path.write_text('scenario = "scenario.toml"')
     (cell,) = load_cells(path)
+    assert list(GridReader(path).labels()) == labels_of([cell])
     assert cell.id.startswith("line-ball-gradient-0-")
     assert cell.scenario.attack.method.iterations(1) == 3
     guide = Path(__file__).parents[3] / "docs/howto/sweep.md"
@@ -72,6 +79,7 @@ def test_objects_are_drawn_by_the_rule(tmp_path):
     path.write_text("seeds = [1, 2]\n" + DRAWN)
     cells = load_cells(path)
     assert load_cells(path) == cells
+    assert list(GridReader(path).labels()) == labels_of(cells)
     drawn = {(c.route, c.objects): c.scenario.objects for c in cells}
     names = [(route, f"two.{k}") for route in ("right", "left") for k in (1, 2)]
     assert sorted(drawn) == sorted(names) and len(cells) == 2 * len(names)
