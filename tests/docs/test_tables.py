@@ -102,6 +102,25 @@ def test_fewer_photographs_equal_their_file():
         assert f"| {own} | {others} |" in text
 
 
+def test_a_policy_of_minutes_equals_its_file():
+    text, card = page("training"), read("training/card.json")
+    drives = []
+    for route in ("straight", "right", "left"):
+        cases = [
+            card[where][route][case]
+            for where in ("surrogate", "mitsuba")
+            for case in ("no_object", "random")
+        ]
+        drives += cases
+        cells = " | ".join(f"{case['cross_track_mean_m']:.3f}" for case in cases)
+        assert f"| {route} | {cells} |" in text
+    count = sum(case["n"] for case in drives)
+    assert not any(case["drives_departed"] for case in drives)
+    assert f"None of {count} drives left its lane" in text
+    largest = max(case["cross_track_max_m"] for case in drives)
+    assert f"distance was {largest:.2f} m" in " ".join(text.split())
+
+
 def test_rows_made_again_equal_their_file():
     row = read("quick/check.json")
     cells = f"{row['rows']} of {row['of']} | {row['largest_m']:g} m"
