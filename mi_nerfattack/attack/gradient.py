@@ -81,7 +81,6 @@ class GradientAttack(AbstractAttack):
         self.optimiser: Adam = Adam(lr=1.0)
         self.predicted_gains: list[float] = []
         self._colourings: dict[str, AbstractColouring] = {}
-        self._values: Parameters = {}  # what the optimiser has, not to be changed
         self._offsets_before = self.best_offsets
         self._depended = np.zeros(len(self.sensor.objects), bool)
         self._best: Parameters = {}  # of the iteration with the least objective
@@ -97,9 +96,9 @@ class GradientAttack(AbstractAttack):
                     )
                 self._colourings[str(i)] = colouring
                 self._best[str(i)] = colouring.start
-                self._set(str(i), colouring.start)
+                self.optimiser[str(i)] = _tensor(colouring.start)
         if self.freedom.pose_rate is not None:
-            self._set(OFFSETS, self.best_offsets)
+            self.optimiser[OFFSETS] = _tensor(self.best_offsets)
 
     @property
     def is_over(self) -> bool:
@@ -128,9 +127,9 @@ class GradientAttack(AbstractAttack):
             record = self._record(evaluation)
             rollout = self.plan.followed(self.rollout, self._objectives)
             gradient = rollout.gradient(evaluation, moved, on_step=on_step)
-        gradients = self._gradients(gradient)
+        values = self._values(gradient)
         self.whole = False
-        gain = self._update(gradients)
+        gain = self._update(values)
         self.history.append(record)
         self.predicted_gains.append(gain)
         self.whole = True
@@ -141,12 +140,12 @@ class GradientAttack(AbstractAttack):
         if self.plan.starts_over(self.iteration):
             values = self._start(self.plan.try_index(self.iteration))
         elif self.plan.resets_moments(self._objectives):
-            values = dict(self._values)
+            values = {key: self._value(key) for key in self.optimiser}
         else:
             return
         self.optimiser = Adam(lr=1.0)
         for key, value in values.items():
-            self._set(key, value)
+            self.optimiser[key] = _tensor(value)
 
     def _start(self, number: int | None) -> Parameters:
         """Return what a try starts from; None for the best of all tries."""
@@ -252,7 +251,7 @@ class GradientAttack(AbstractAttack):
                 stack.enter_context(field.one_level(level))
             yield
 
-    def _gradients(self, gradient: Gradient) -> Parameters:
+    def _values(self, gradient: Gradient) -> Parameters:
         """Return the gradient by the optimiser's keys, checked."""
         colours = self._colours()
         values = {
@@ -279,7 +278,7 @@ class GradientAttack(AbstractAttack):
                 self._depended |= value.any(axis=1)
             else:
                 self._depended[int(key)] |= value.any()
-        before = dict(self._values)
+        before = {key: self._value(key) for key in gradients}
         scale = self.plan.gradient_scale(list(gradients.values()))
         values = {
             key: self._colourings[key].smoothed(value) if key != OFFSETS else value
@@ -293,25 +292,17 @@ class GradientAttack(AbstractAttack):
             dr.set_grad(self.optimiser[key], _tensor(value / scale))
         self.optimiser.step()
         # Back to the colours and poses that are allowed
-        self._read()
-        for key, value in self._values.items():
-            if key == OFFSETS:
-                self._set(key, self.freedom.project(value.astype(np.float64)))
-            else:
-                self._set(key, self._colourings[key].project(value))
-        steps = {key: self._values[key] - old for key, old in before.items()}
+        for key, value in self._colours().items():
+            self.optimiser[key] = _tensor(self._colourings[key].project(value))
+        if OFFSETS in values:
+            moved = np.array(dr.detach(self.optimiser[OFFSETS]), np.float64)
+            self.optimiser[OFFSETS] = _tensor(self.freedom.project(moved))
+        steps = {key: self._value(key) - old for key, old in before.items()}
         return -sum(float((gradients[key] * step).sum()) for key, step in steps.items())
 
-    def _set(self, key: str, value: np.ndarray) -> None:
-        """Give the optimiser a value."""
-        self.optimiser[key] = _tensor(value)
-        self._values[key] = value.astype(np.float32)
-
-    def _read(self) -> None:
-        """Copy all values of the optimiser."""
-        self._values = {
-            key: dr.detach(self.optimiser[key]).numpy().copy() for key in self.optimiser
-        }
+    def _value(self, key: str) -> np.ndarray:
+        """Return what the optimiser has, copied."""
+        return dr.detach(self.optimiser[key]).numpy().copy()
 
     def _install(self) -> None:
         """Give the sensor the optimiser's parameters."""
@@ -319,11 +310,11 @@ class GradientAttack(AbstractAttack):
             textures = self._textures(self._colours())
             self.sensor.set_textures([_tensor(texture) for texture in textures])
         if self.freedom.pose_rate is not None:
-            move_all(self.sensor.objects, self._values[OFFSETS].astype(np.float64))
+            move_all(self.sensor.objects, self._value(OFFSETS).astype(np.float64))
 
     def _colours(self) -> Parameters:
         """Return what is stepped in, by the optimiser's key."""
-        return {key: self._values[key] for key in self._colourings}
+        return {key: self._value(key) for key in self._colourings}
 
     def _penalty(self, colours: Parameters) -> float:
         return sum(c.penalty(colours[key]) for key, c in self._colourings.items())
@@ -356,7 +347,6 @@ class GradientAttack(AbstractAttack):
             if not (allowed and np.isfinite(best).all()):
                 raise InputError(f"best.{key}: colours that the attack may not have")
         load_adam(self.optimiser, tensors)
-        self._read()
         self.restore_best()
 
     def go_on_from(self, tensors: dict[str, np.ndarray]) -> None:
@@ -377,7 +367,6 @@ class GradientAttack(AbstractAttack):
                 self.best_offsets = project(tensors["best_offsets"])
             else:
                 self._best[key] = project(tensors[f"best.{key}"])
-        self._read()
 
     def _read_history(self, tensors: dict[str, np.ndarray]) -> None:
         history, gains = read_history(tensors), tensors["predicted_gains"].tolist()

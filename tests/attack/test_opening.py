@@ -200,9 +200,9 @@ def test_its_moments_are_forgotten(parts):
     attack = attack_of(parts, plan)
     steps = []
     for _ in range(3):
-        before = attack._values["0"]
+        before = attack._value("0")
         attack.step()
-        steps.append(np.abs(attack._values["0"] - before).max())
+        steps.append(np.abs(attack._value("0") - before).max())
     assert attack.tensors()["time.0"].item() == 1  # steps of this part
     assert steps[2] == pytest.approx(steps[0], rel=1e-3)
 
