@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import pandas as pd
 from matplotlib.figure import Figure
 
 from mi_nerfattack.evaluation.summary import Interval
@@ -35,6 +36,15 @@ class Finding:
     draw: Callable[[Figure], None]
     pandas: str
     threats: tuple[str, ...] = ()
+
+
+def with_labels(drives: pd.DataFrame) -> pd.DataFrame:
+    """Return drives of a transfer with the method and the seed of each attack.
+
+    The name of an attack ends with the method, the seed of the place and a digest.
+    """
+    parts = drives["attack"].str.split("-")
+    return drives.assign(method=parts.str[-3], seed=parts.str[-2])
 
 
 def ends_cell(ends: Interval, digits: int = 3) -> str:

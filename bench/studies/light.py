@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from bench.studies.charts import draw_heat
-from bench.studies.content import ERROR, Finding, ends_cell
+from bench.studies.content import ERROR, Finding, ends_cell, with_labels
 from mi_nerfattack.evaluation.summary import Interval, interval
 from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT
 from mi_nerfattack.scenario.deployment import SURROGATE
@@ -93,10 +93,7 @@ def _stayed(drives: pd.DataFrame, kept: pd.DataFrame) -> str:
 
 def _errors(drives: pd.DataFrame, case: str, value: str = ERROR) -> pd.DataFrame:
     """Return a value of a case by method, route and seed, and where it drives."""
-    own = drives[drives["case"] == case]
-    # Names of attacks end with the method, the seed of the place and a digest
-    parts = own["attack"].str.split("-")
-    own = own.assign(method=parts.str[-3], seed=parts.str[-2])
+    own = with_labels(drives[drives["case"] == case])
     rows, columns = ["method", "route", "seed"], ["environment", "condition"]
     return own.pivot_table(value, rows, columns, sort=False)
 

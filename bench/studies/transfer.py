@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from bench.studies.charts import draw_heat
-from bench.studies.content import ERROR, HALF, Finding, ends_cell
+from bench.studies.content import ERROR, HALF, Finding, ends_cell, with_labels
 from mi_nerfattack.evaluation.summary import interval
 from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT
 from mi_nerfattack.scenario.deployment import SURROGATE
@@ -70,12 +70,11 @@ def _to_surrogate(drives: pd.DataFrame, case: str) -> pd.DataFrame:
     Returns:
         Mean logarithms of a place (row), by environment and condition.
     """
-    rows, columns = ["route", "attack"], ["environment", "condition"]
+    rows, columns = ["route", "seed", "attack"], ["environment", "condition"]
+    told = with_labels(drives)
     table, attacks = (
-        drives[drives["case"] == name].pivot_table(ERROR, rows, columns, sort=False)
+        told[told["case"] == name].pivot_table(ERROR, rows, columns, sort=False)
         for name in (case, ATTACK)
     )
     logs = table.div(attacks[SURROGATE]["day"], axis=0).map(math.log)
-    # The name of an attack ends with the seed of its place and a digest
-    seeds = logs.index.get_level_values("attack").str.split("-").str[-2]
-    return logs.groupby([logs.index.get_level_values("route"), seeds]).mean()
+    return logs.groupby(["route", "seed"]).mean()
