@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from bench.results import Comparison, Progress, compare
+from bench.results import Comparison, Progress, compare, cpu_seconds
 from bench.tables import markdown
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy
 from mi_nerfattack.commands.shared.terminal import Result
@@ -53,7 +52,7 @@ class BenchAccuracy(Comparison):
     The bundled fields are marched in steps that are 2, 4 and 8 times as fine as those
     of the file. A hydrant stands in the road, composited by depth and exactly. Each
     bundled object is shown as one level and with all levels. The medians of the times
-    count. Takes about two minutes.
+    count. Takes about a minute.
     """
 
     def run(self) -> Result:
@@ -177,13 +176,7 @@ def _psnr(error: np.ndarray) -> float:
 
 def _seconds(work: Callable[[], Any], repeats: int) -> float:
     """Return the median of the processor times, after a first one that compiles."""
-    times = []
-    for _ in range(repeats + 1):
-        dr.sync_thread()
-        start = time.process_time()
-        dr.eval(work())
-        dr.sync_thread()
-        times.append(time.process_time() - start)
+    times = [cpu_seconds(lambda: dr.eval(work())) for _ in range(repeats + 1)]
     return statistics.median(times[1:])
 
 

@@ -12,7 +12,7 @@ import tyro
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
-from bench.results import run_command
+from bench.results import run_command, stamp
 from bench.tables import markdown
 from mi_nerfattack import variant
 from mi_nerfattack.capture.coverage import view_gaps
@@ -79,7 +79,7 @@ class BenchPoses:
             and document["rotation_deg"] <= ROTATION_DEG
             and document["position_share"] <= POSITION
         )
-        files.write_json(work / FIGURES, document)
+        files.write_json(work / FIGURES, stamp(document, "python -m bench poses"))
         rows = [(name, f"{value:.5g}") for name, value in document.items()]
         table = markdown(("figure", "value"), rows)
         return Result(document, lambda: print(table), int(not good))
@@ -113,7 +113,8 @@ class BenchGaps:
         check_positive(self, "steps", "long_edge")
         files.make_folder(self.output)
         found = [thinned(self, every) for every in self.every]
-        files.write_json(self.output / FIGURES, {"rows": found})
+        told = stamp({"rows": found}, "python -m bench gaps")
+        files.write_json(self.output / FIGURES, told)
         header = (
             "fitted to",
             "PSNR of these",

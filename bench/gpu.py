@@ -57,9 +57,9 @@ _TESTS = ("-m", "pytest", "-q", "-m", "not slow", "-k", "cuda_ad", "-n", "4", "t
 PLAN = (
     _bench("frames", 60, "--size", "336x188", "--batches", "1", "8", "32", "128"),
     _bench("render", 100, "--sizes", "366x188", "--repeats", "3"),
-    _bench("attack", 120, "--sizes", "200x66", "--repeats", "1"),
+    _bench("attack", 150, "--sizes", "200x66", "--repeats", "1"),
     _bench("fit", 110, "--repeats", "2"),
-    Step("tests", _TESTS, 190),
+    Step("tests", _TESTS, 160),
 )
 
 

@@ -10,12 +10,14 @@ import shlex
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
+import drjit as dr
 import tyro
 
 from mi_nerfattack import variant
@@ -95,6 +97,15 @@ def compare(
     with progress() as show, tempfile.TemporaryDirectory() as folder:
         document = publish(name, options, measure(options, Path(folder), show))
     return Result(document, lambda: print(*lines(document), sep="\n"))
+
+
+def cpu_seconds(work: Callable[[], Any]) -> float:
+    """Return the processor time of work, with the kernels that it launched."""
+    dr.sync_thread()
+    start = time.process_time()
+    work()
+    dr.sync_thread()
+    return time.process_time() - start
 
 
 def machine() -> dict[str, Any]:

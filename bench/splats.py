@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from bench.results import Comparison, Progress, compare, read_sizes
+from bench.results import Comparison, Progress, compare, cpu_seconds, read_sizes
 from bench.tables import markdown
 from mi_nerfattack.commands.shared.terminal import Result
 from mi_nerfattack.ranges import Count
@@ -64,21 +63,13 @@ def measure(options: BenchSplats, folder: Path, show: Progress) -> dict[str, Any
             show(f"splats {text}", turn, WARM_UP + options.repeats, "")
             for name, tasks in sides.items():
                 for task, work in tasks.items():
-                    turns.setdefault(f"{name}_{task}", []).append(_seconds(work))
+                    turns.setdefault(f"{name}_{task}", []).append(cpu_seconds(work))
         row = {k: statistics.median(v[WARM_UP:]) for k, v in turns.items()}
         for task in ("frame", "gradient"):
             peer = row[f"volprim_rf_basic_{task}"]
             row[f"{task}_ratio"] = peer / row[f"ours_{task}"]
         document["sizes"][text] = row
     return document
-
-
-def _seconds(work: Callable[[], None]) -> float:
-    dr.sync_thread()
-    start = time.process_time()
-    work()
-    dr.sync_thread()
-    return time.process_time() - start
 
 
 def _side(

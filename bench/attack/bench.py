@@ -10,11 +10,12 @@ from typing import Any
 
 from bench.attack.drive import OBJECT_POSE, Job
 from bench.ngp_data import NGPData
-from bench.results import Comparison, Progress, compare, read_sizes, run_command
+from bench.results import Comparison, Progress, compare, read_sizes, run_for_output
 from bench.tables import markdown, number
 from bench.torch.object import ObjectData
 from bench.worker import Worker, medians
 from mi_nerfattack.commands.shared.terminal import Result
+from mi_nerfattack.errors import NerfAttackError
 from mi_nerfattack.fields import NGPField, load_field, load_grid
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.scenes import bundled
@@ -40,7 +41,7 @@ class BenchAttack(Comparison):
 
     One drive past the bundled hydrant, both sides in turns, in processes of their own,
     on all cores; medians count. We also drive before the scene in bricks, PyTorch does
-    not. Keep the machine otherwise idle. Takes about twenty minutes.
+    not. Keep the machine otherwise idle. Takes about five minutes.
     """
 
     repeats: int = 3
@@ -64,7 +65,9 @@ def measure(options: BenchAttack, folder: Path, show: Progress) -> dict[str, Any
     ObjectData.of(PosedField(hydrant, OBJECT_POSE)).write(item)
     bricks = folder / "bricks.safetensors"
     words = ["bake", str(bundled("base.toml")), "-o", str(bricks)]
-    run_command([*words, *(["--passes", "0"] if options.quick else [])])
+    code, text = run_for_output([*words, *(["--passes", "0"] * options.quick)])
+    if code:
+        raise NerfAttackError(f"bench: `bake` ended with exit code {code}: {text}")
     horizon = 2 if options.quick else HORIZON
     sizes = read_sizes(options.sizes)
     rows: dict[str, Any] = {}

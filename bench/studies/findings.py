@@ -34,9 +34,8 @@ from bench.studies.limits import limits
 from bench.studies.plan import Study, state
 from bench.studies.transfer import transfer
 from mi_nerfattack.drives.table import records, with_starts
-from mi_nerfattack.evaluation.pairs import compare
+from mi_nerfattack.evaluation.pairs import Effect, compare
 from mi_nerfattack.evaluation.summary import (
-    Interval,
     share_interval,
     summary,
 )
@@ -129,45 +128,55 @@ def attack(drives: pd.DataFrame) -> Finding:
             f"from the lane centre on average, and the worst random texture "
             f"{found.other:.3f} m (ratio {found.ratio:.1f}, "
             f"{interval_words(found.ratio_ci95, 1)}).",
-            f"The attack is farther at {places}. At {out} places, a wheel is outside "
-            "of the lane for at least a second, on average over the drives of a place "
-            f"(share: {interval_words(share_interval(out, found.attacks), 2)}).",
+            f"The attack is farther at {places}. At {out} of {found.attacks} places, "
+            "the attack keeps a wheel out of the lane for 1 s or more, on average over "
+            "the drives of the place (share: "
+            f"{interval_words(share_interval(out, found.attacks), 2)}).",
             f"The mean difference is {found.difference:.3f} m, and its standard "
             f"deviation between the places of a route is {metres(found.spread)}.",
         ),
-        ["texture", "environment", "mean error (m)", "95 % interval", "a wheel out"],
+        [
+            *("texture", "environment", "mean error (m)", "95 % interval"),
+            "places with a wheel out for 1 s",
+        ],
         rows,
         lambda figure: draw_places(figure, errors),
         f'deployed = drives[drives.environment == "{where}"]\n'
         'print(deployed.groupby(["route", "case"]).cross_track_mean_m.mean())',
-        tuple(_threats_to_attack(by_case, found.ratio_ci95)),
+        tuple(_threats_to_attack(by_case, found)),
     )
 
 
 def _threats_to_attack(
-    by_case: Mapping[str, pd.DataFrame], ratio_ci95: Interval
+    by_case: Mapping[str, pd.DataFrame], found: Effect
 ) -> Iterator[str]:
     """Yield what speaks against the finding about the attack.
 
     Args:
         by_case: drives in the deployment environment.
-        ratio_ci95: interval of the ratio of attack and worst random texture.
+        found: attack and worst random texture, compared.
     """
-    if ratio_ci95 is not None and ratio_ci95[0] <= 1:
+    if found.ratio_ci95 is not None and found.ratio_ci95[0] <= 1:
         yield (
             "The interval of the ratio of the means contains 1, because a few attacks "
             "are much stronger than the others. So the title counts places."
         )
+    if found.spread is not None and found.spread > found.difference:
+        yield (
+            "The spread between places is larger than the mean difference, so one more "
+            "place can change the mean a lot."
+        )
     own, random = by_case[ATTACK], by_case[BEST_RANDOM]
+    cost, most = random["frames"].max(), own["frames"].max()
     yield (
         "The worst random texture is the one with the largest error in the surrogate. "
-        f"The random textures cost {random['frames'].max():,} frames, and the attack "
-        f"up to {own['frames'].max():,}. [The page about the gradient](gradient.md) "
-        "compares at equal cost."
+        f"The random textures cost {cost:,} frames, and the attack up to {most:,}, so "
+        f"they had {cost / most:.0%} of its budget. [The page about the "
+        "gradient](gradient.md) compares at equal cost.".replace("%", " %")
     )
     left = own.groupby("route", sort=False)["departed"].agg(["sum", "size"])
     counts = ", ".join(f"{route} {x} of {n}" for route, x, n in left.itertuples())
-    yield f"Drives that leave the lane, by route: {counts}."
+    yield f"By route, so many drives with the attack leave the lane: {counts}."
     means = _by_place(own)
     yield (
         f"One place, {_name(means.idxmax())}, has a mean error of {means.max():.2f} m. "
@@ -191,16 +200,18 @@ def gradient(drives: pd.DataFrame) -> Finding:
         sum(farther[name][1] for name in names) for names in (without, others)
     )
     title = (
-        f"The gradient beats {better} of {len(without)} searches without a gradient at "
-        "equal cost"
+        f"The gradient moves the car farther than {better} of {len(without)} searches "
+        "without a gradient at equal cost"
     )
     close, nearest = min(fair.items(), key=lambda item: item[1].ratio or 0.0)
     wins = [farther[name][0] for name in fair]
-    rows = [
+    head = [GRADIENT, f"{frames[GRADIENT]:.0f}", f"{nearest.one:.3f}"]
+    rows = [head + 5 * ["–"]] + [
         [
             *(name, f"{frames[name]:.0f}", f"{effect.other:.3f}"),
             *(f"{effect.ratio:.2f}", ends_cell(effect.ratio_ci95, 2)),
-            *(f"{farther[name][0]}/{effect.attacks}", metres(effect.spread)),
+            f"{farther[name][0]}/{effect.attacks}",
+            *(metres(effect.difference), metres(effect.spread)),
         ]
         for name, effect in found.items()
     ]
@@ -209,8 +220,8 @@ def gradient(drives: pd.DataFrame) -> Finding:
         (
             f"Over {nearest.attacks} places, the gradient moves the car "
             f"{nearest.one:.2f} m from the lane centre on average in the surrogate, "
-            f"and beats {also} of {len(others)} other searches that use a gradient "
-            f"({', '.join(f'`{name}`' for name in others)}).",
+            f"and is farther than {also} of {len(others)} other searches that use a "
+            f"gradient ({', '.join(f'`{name}`' for name in others)}).",
             f"The closest other search is `{close}`: the gradient moves the car "
             f"{nearest.ratio:.2f} times as far "
             f"({interval_words(nearest.ratio_ci95, 2)}).",
@@ -220,7 +231,7 @@ def gradient(drives: pd.DataFrame) -> Finding:
         ),
         [
             *("search", "frames", "mean error (m)", "gradient to search"),
-            *("95 % interval", "gradient farther", "spread of the difference"),
+            *("95 % interval", "gradient farther", "difference", "its spread"),
         ],
         rows,
         lambda figure: draw_ratios(
@@ -245,7 +256,7 @@ def _threats_to_gradient(
         if name not in (GRADIENT, *fair):
             yield (
                 f"`{name}` cost {frames[name]:.0f} frames and the gradient "
-                f"{frames[GRADIENT]:.0f}, so the comparison leaves this search out."
+                f"{frames[GRADIENT]:.0f}, so the title does not count this search."
             )
     places = own.groupby(["scenario", "seed", "method"])[ERROR].mean().unstack()
     behind = places[places[GRADIENT] < places[fair].max(axis=1)]
@@ -273,13 +284,14 @@ def searches(drives: pd.DataFrame) -> Finding:
         title,
         (
             f"Of the {len(rank)} searches with an attack on each of these routes, "
-            f"`{best}` has the largest geometric mean, {rank.max():.2f} m.",
+            f"`{best}` has the largest geometric mean of the error in the surrogate, "
+            f"{rank.max():.2f} m.",
             "There is one place per route, so the table has no intervals and the order "
             "is uncertain.",
             "Between the starts of one attack, the error has a standard deviation of "
             f"{spread:.3f} m on average.",
         ),
-        ["search", *(f"{route} (m)" for route in errors.columns)],
+        ["search", *(f"{route}, surrogate (m)" for route in errors.columns)],
         [
             [str(name), *("–" if pd.isna(x) else f"{x:.3f}" for x in line)]
             for name, line in zip(errors.index, errors.to_numpy(), strict=True)
@@ -292,28 +304,36 @@ def searches(drives: pd.DataFrame) -> Finding:
 def flat(drives: pd.DataFrame) -> Finding:
     """Count the drives that leave the lane, as bench/flat.toml says."""
     own = drives[drives["environment"] == "built_in"]
-    groups = summary(own, ["case"], ["cell"]).set_index("case")
-    groups = groups.loc[[case for case in _CASES if case in groups.index]]
-    left, count = groups["drives_departed"], groups["drives"]
-    shares = {_CASES[case]: left[case] / count[case] for case in groups.index}
-    interval_of_share = share_interval(left[ATTACK], count[ATTACK])
+    left, count = (
+        own.groupby("case")["departed"].agg(how).astype(int) for how in ("sum", "count")
+    )
+    shares = {name: left[c] / count[c] for c, name in _CASES.items() if c in left}
+    places = own[own["case"] == ATTACK].groupby("cell")["departed"].any()
+    out, all_places = int(places.sum()), len(places)
+    ends = share_interval(out, all_places)
     percent = f"{100 * shares[_CASES[ATTACK]]:.0f} %"
     title = f"Flat objects send the car out of its lane in {percent} of the drives"
+    kinds = summary(own, ["objects", "case"], ["cell"])
     return Finding(
         title,
         (
-            f"With the attacked picture, {left[ATTACK]} of {count[ATTACK]} drives "
-            "leave the lane in the path-traced scene, where sun and sky of the scene "
-            f"light the picture (share: {interval_words(interval_of_share, 2)}).",
-            f"With random pictures, {left[RANDOM]} of {count[RANDOM]} drives leave the "
+            f"With the attack, {left[ATTACK]} of {count[ATTACK]} drives leave the lane "
+            "in the path-traced scene, where its sun and sky light the object. "
+            f"These drives are at {out} of {all_places} places (share: "
+            f"{interval_words(ends, 2)}).",
+            f"With random textures, {left[RANDOM]} of {count[RANDOM]} drives leave the "
             "lane.",
             "The aim that we set before the first result is 60 % of the drives with "
-            "the attack, and none with random pictures.",
+            "the attack, and none with random textures.",
         ),
-        ["picture", "mean error (m)", "drives that leave the lane"],
+        ["object", "texture", "mean error, `built_in` (m)", "drives out of the lane"],
         [
-            [_CASES[case], f"{groups[ERROR][case]:.3f}", f"{left[case]}/{count[case]}"]
-            for case in groups.index
+            [
+                *(row["objects"], _CASES[row["case"]], f"{row[ERROR]:.3f}"),
+                f"{row['drives_departed']}/{row['drives']}",
+            ]
+            for row in records(kinds)
+            if row["case"] in _CASES
         ],
         lambda figure: draw_shares(
             figure, shares, "share of drives that leave the lane"

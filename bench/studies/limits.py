@@ -45,16 +45,18 @@ def limits(places: pd.DataFrame) -> Finding:
         f"Objects can take the car off the lane at {rows['out'].sum():.0f} of "
         f"{len(rows)} places",
         (
-            "With the strongest value of each pixel in each frame, the car leaves the "
-            f"lane at {', '.join(counts)}.",
-            f"The reach is smallest for {weakest}: in the median, these objects can "
-            f"change the control by {medians[weakest]:.2f} rad/s.",
-            "With the original colours, the largest error has a median of "
-            f"{rows['original_m'].median():.2f} m.",
+            "The reach is the largest change of the control that the pixels of the "
+            "objects can cause, in rad/s. If each pixel takes its worst value in each "
+            f"frame, the car leaves the lane at {', and at '.join(counts)}.",
+            f"The reach is smallest for {weakest}: {medians[weakest]:.2f} rad/s in the "
+            "median.",
+            "Over all places, the largest error with the original colours has a median "
+            f"of {rows['original_m'].median():.2f} m.",
         ),
         [
-            *("objects", "route", "off the lane", "pixels", "reach (rad/s)"),
-            *("largest error, original (m)", "largest error, with the reach (m)"),
+            *("objects", "route", "places off the lane", "pixels, median"),
+            "reach, median (rad/s)",
+            *("largest error, original, median (m)", "with the reach, median (m)"),
         ],
         lines,
         lambda figure: draw_shares(

@@ -342,8 +342,8 @@ def _split(line: str, study: Study) -> list[str]:
     if "{data}" in line:
         if not (data := os.environ.get("NERFATTACK_DATA")):
             raise InputError("NERFATTACK_DATA: set it to the folder that has `fox`")
-        line = line.replace("{data}", data)
-    words = shlex.split(line.replace("{work}", str(study.work)))
+        line = line.replace("{data}", shlex.quote(data))
+    words = shlex.split(line.replace("{work}", shlex.quote(str(study.work))))
     return [name for word in words for name in _expanded(word)]
 
 

@@ -31,8 +31,8 @@ def transfer(drives: pd.DataFrame) -> Finding:
     lost = sum(high < HALF for _, high in ends.values())
     count = len(by_day)
     title = (
-        f"Attacks keep more than half of their error in {kept} of {count} "
-        f"environments, and less than half in {lost}"
+        f"By day, the best attacks keep more than half of their error in {kept} of "
+        f"{count} environments, and less than half in {lost}"
     )
     return Finding(
         title,
@@ -48,7 +48,7 @@ def transfer(drives: pd.DataFrame) -> Finding:
         ),
         [
             *("environment, by day", "error to the surrogate's", "95 % interval"),
-            "without objects",
+            "the same without objects",
         ],
         [
             [str(n), f"{x:.2f}", ends_cell(ends.get(n), 2), f"{y:.2f}"]
@@ -58,8 +58,8 @@ def transfer(drives: pd.DataFrame) -> Finding:
         "own = drives.query(\"case == 'attack' and condition == 'day'\")\n"
         'print(own.pivot_table("cross_track_mean_m", "environment", "route"))',
         (
-            "Grey cells of the chart are not driven. The labels are those of "
-            "[transfer](../../howto/transfer.md).",
+            "A grey cell of the chart means: no drive exists. "
+            "[transfer](../../howto/transfer.md) explains the labels.",
         ),
     )
 

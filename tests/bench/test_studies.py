@@ -146,11 +146,12 @@ def test_the_gradient_is_compared_with_each_search():
     cheap = rows["method"] == "single_frame"
     rows.loc[cheap, "frames"] = 7  # of 9
     found = made("gradient", rows)
-    assert "beats 1 of 2 searches without a gradient" in found.title
+    assert "farther than 1 of 2 searches without a gradient" in found.title
     assert "0 of 0 other searches" in found.sentences[0]
     assert "`single_frame`" in found.threats[0]
     assert len(found.threats) == 1 + 6  # places where `blocks` is better
-    assert [row[3] for row in found.rows] == ["2.00", "0.80", "4.00"]
+    assert [row[3] for row in found.rows] == ["–", "2.00", "0.80", "4.00"]
+    assert [row[6] for row in found.rows] == ["–", "0.20 m", "-0.10 m", "0.30 m"]
     assert "`blocks`" in found.sentences[1] and "0 to 6 of 6" in found.sentences[2]
 
 
@@ -196,21 +197,27 @@ def test_light_counts_aims_and_where_varying_helps():
     rows = light_rows({"plain": 1.0, "vary": 2.0}, where)
     found = made("light", rows)
     assert "in 1 of 3 environments and conditions; `vary` helps in 3" in found.title
-    assert "least share is 0.59, in `mitsuba`, evening" in found.sentences[0]
-    assert "10 attacks at 5 places" in found.sentences[2]
-    by_place = {tuple(row[:2]): row[2:6] for row in found.rows}
-    assert by_place == {
-        ("mitsuba", "day"): ["0.88", "0.90", "0.22", "0.88"],
-        ("mujoco_built_in", "day"): ["0.72", "0.70", "0.18", "0.72"],
-        ("mitsuba", "evening"): ["0.59", "0.60", "0.15", "0.59"],
+    assert "5 attacks with `vary` and 5 attacks with `plain`" in found.sentences[0]
+    missed = "misses the aim in `mitsuba` day, `mitsuba` evening."
+    assert missed in found.sentences[1] and "in 1 of 3 rows" in found.sentences[1]
+    by_place = {tuple(row[:2]): row[2:7] for row in found.rows}
+    assert {place: [row[0], *row[2:]] for place, row in by_place.items()} == {
+        ("mitsuba", "day"): ["0.88", "0.90", "0.88", "0.22"],
+        ("mujoco_built_in", "day"): ["0.72", "0.70", "0.72", "0.18"],
+        ("mitsuba", "evening"): ["0.59", "0.60", "0.59", "0.15"],
     }
-    assert {row[6] for row in found.rows} == {"2.00 to 2.01"}
-    (threat,) = found.threats
-    assert "in `mujoco_built_in` by day, 2 of the 2 cars stay" in threat
-    assert "At the other 3 places, the share is 0.72." in threat
+    for kept, ends, *_ in by_place.values():
+        assert ends in (f"{kept} to {kept}", f"{kept} to {float(kept) + 0.01:.2f}")
+    assert {row[7] for row in found.rows} == {"2.00 to 2.01"}
+    threat = found.threats[-1]
+    assert "2 cars leave the lane in the surrogate, and 2 of them stay" in threat
+    assert (
+        "in `mujoco_built_in`. The attacks at the other 3 places keep 0.72." in threat
+    )
     alone = made("light", rows[rows["attack"].str.contains("vary")])
     assert "`vary` helps in 0" in alone.title
-    assert {row[6] for row in alone.rows} == {"–"}
+    assert "0 attacks with `plain`" in alone.sentences[0]
+    assert {row[7] for row in alone.rows} == {"–"}
 
 
 def test_limits_counts_places_beyond_the_lane():
@@ -336,9 +343,11 @@ def test_quick_compares_with_the_committed_rows(study, monkeypatch, capsys):
 
 
 def test_the_state_is_listed_and_wrong_options_are_refused(capsys):
-    assert main(["results", "--list", "--only", "retrain", "speed", "--json"]) == 0
+    assert (
+        main(["results", "--list", "--only", "retrain", "photographs", "--json"]) == 0
+    )
     document = json.loads(capsys.readouterr().out)
-    assert document["speed"]["done"] == document["speed"]["wanted"]
+    assert document["photographs"]["done"] == document["photographs"]["wanted"]
     assert document["hours_left"] == document["retrain"]["hours_left"] > 0
     for words, where in ((["--only", "none"], "--only"), (["--list", "--check"], "--")):
         assert main(["results", *words]) == cli.EXIT_INPUT

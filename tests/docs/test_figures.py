@@ -184,6 +184,21 @@ def test_the_table_of_attacks_equals_its_file():
     ):
         assert f"| {name} | {told(key, to, 'drives')} |" in text
     assert f"| PyTorch | {told('torch', kept, 'times')} |" in text
+    drives = [row[f"{kept}_seconds"] / row["rollout_seconds"] for row in rows]
+    again = [row["replay_seconds"] / row["rollout_seconds"] for row in rows]
+    faster = [row["torch_seconds"] / row[f"{kept}_seconds"] for row in rows]
+    words = " ".join(text.split())
+    assert f"as long as {min(drives):.1f} to {max(drives):.1f} drives" in words
+    assert f"{min(faster):.0f} to {max(faster):.0f} times as fast" in words
+    assert f"`replay` needs {min(again):.1f} to {max(again):.1f} drives" in words
+    assert f"{min(faster):.0f} to {max(faster):.0f} times as fast" in page("bench")
+    shares = [row["settings"]["ours"] for row in rows]
+    cells = " | ".join(
+        f"{100 * x['object_share_mean']:.1f} %, {100 * x['object_share_max']:.1f} %"
+        for x in shares
+    )
+    assert f"| object in the frame, mean and largest | {cells} |" in text
+    assert not any(row["kernels_compiled_after_warmup"] for row in rows)
     for name, key in (
         ("a drive alone", "rollout"),
         ("a drive alone, in bricks", "bricks_rollout"),

@@ -42,7 +42,7 @@ SKIPPED = {
     **dict.fromkeys("howto/reproduce howto/sweep howto/sweep_cluster".split(), USAGE),
     **dict.fromkeys("results/accuracy results/attack_size".split(), LONG),
     **dict.fromkeys("results/attack_speed results/rendering".split(), LONG),
-    **dict.fromkeys("results/reach results/studies".split(), LONG),
+    **dict.fromkeys("results/reach results/training".split(), LONG),
     **dict.fromkeys("results/photographs results/pages".split(), INPUT),
     "results/gpu": "takes a GPU",
     "results/certificates": LONG,

@@ -10,7 +10,8 @@ import pytest
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.sweep import grid as module
-from mi_nerfattack.experiment.sweep.grid import Cell, GridReader, load_cells
+from mi_nerfattack.experiment.sweep.cell import Cell
+from mi_nerfattack.experiment.sweep.grid import GridReader, load_cells
 from mi_nerfattack.io.strict import parse_toml
 from mi_nerfattack.vehicle.route.route import Route
 
