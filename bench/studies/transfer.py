@@ -31,8 +31,8 @@ def transfer(drives: pd.DataFrame) -> Finding:
     lost = sum(high < HALF for _, high in ends.values())
     count = len(by_day)
     title = (
-        f"By day, the best attacks keep more than half of their error in {kept} of "
-        f"{count} environments, and less than half in {lost}"
+        f"By day, the best attacks keep over half of their error in {kept} of {count} "
+        f"environments, under half in {lost}"
     )
     return Finding(
         title,

@@ -169,7 +169,7 @@ def test_transfer_counts_places_not_attacks():
         )
     ]
     found = made("transfer", pd.DataFrame(rows))
-    assert "in 1 of 2 environments, and less than half in 1" in found.title
+    assert "in 1 of 2 environments, under half in 1" in found.title
     assert "5 places with 10 attacks" in found.sentences[2]
     assert found.rows == [
         ["kept", "0.80", "0.80 to 0.80", "0.10"],
