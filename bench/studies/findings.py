@@ -171,8 +171,8 @@ def _threats_to_attack(
     yield (
         "The worst random texture is the one with the largest error in the surrogate. "
         f"The random textures cost {cost:,} frames, and the attack up to {most:,}, so "
-        f"they had {cost / most:.0%} of its budget. [The page about the "
-        "gradient](gradient.md) compares at equal cost.".replace("%", " %")
+        f"they had {100 * cost / most:.0f} % of its budget. [The page about the "
+        "gradient](gradient.md) compares at equal cost."
     )
     left = own.groupby("route", sort=False)["departed"].agg(["sum", "size"])
     counts = ", ".join(f"{route} {x} of {n}" for route, x, n in left.itertuples())

@@ -64,8 +64,8 @@ def light(drives: pd.DataFrame) -> Finding:
             "keeps' has the error with the attack in the environment, divided by the "
             "error in the surrogate by day (geometric mean over places with one start "
             f"each). The table has {attacks}.",
-            f"`vary` reaches the aim in {met} of {count} rows. It misses the aim in "
-            f"{', '.join(missed) or 'none'}.",
+            f"`vary` reaches the aim in {met} of {count} rows"
+            + (f", and misses it in {', '.join(missed)}." if missed else "."),
             "`vary` helps where the 95 % interval of the ratio of its error to that of "
             "`plain` lies above 1.",
         ),

@@ -141,3 +141,26 @@ def test_the_committed_cells_have_no_path_of_this_machine(studies, tmp_path):
     run.refresh(study)
     text = read_made(study.folder)[CELL]["scenario"]
     assert text == '[scene]\nbricks = "../build/b.safetensors"\n'
+
+
+def test_commands_of_a_study_get_the_folder_of_data(monkeypatch, capsys):
+    study = plan.Study(
+        name="photographs",
+        question="?",
+        table="none",
+        commands=("bench poses {data}/fox -o {work}/poses",),
+        cells=1,
+        core_hours=1,
+        basis="none",
+    )
+    commands = []
+    monkeypatch.setattr(run, "run_command", commands.append)
+    monkeypatch.setattr(run, "choose", lambda names: [study])
+    monkeypatch.setattr(run, "write_pages", lambda: [])
+    monkeypatch.delenv("NERFATTACK_DATA", raising=False)
+    assert main(["results", "--only", "photographs"]) == 1
+    assert "NERFATTACK_DATA: set it" in capsys.readouterr().out
+    monkeypatch.setenv("NERFATTACK_DATA", "/two words")
+    assert main(["results", "--only", "photographs"]) == 0
+    words = "bench", "poses", "/two words/fox", "-o", f"{study.work}/poses"
+    assert commands == [list(words)]

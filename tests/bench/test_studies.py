@@ -198,7 +198,7 @@ def test_light_counts_aims_and_where_varying_helps():
     found = made("light", rows)
     assert "in 1 of 3 environments and conditions; `vary` helps in 3" in found.title
     assert "5 attacks with `vary` and 5 attacks with `plain`" in found.sentences[0]
-    missed = "misses the aim in `mitsuba` day, `mitsuba` evening."
+    missed = "misses it in `mitsuba` day, `mitsuba` evening."
     assert missed in found.sentences[1] and "in 1 of 3 rows" in found.sentences[1]
     by_place = {tuple(row[:2]): row[2:7] for row in found.rows}
     assert {place: [row[0], *row[2:]] for place, row in by_place.items()} == {
