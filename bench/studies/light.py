@@ -67,11 +67,13 @@ def light(drives: pd.DataFrame) -> Finding:
             f"`vary` reaches the aim in {met} of {count} rows"
             + (f", and misses it in {', '.join(missed)}." if missed else "."),
             "`vary` helps where the 95 % interval of the ratio of its error to that of "
-            "`plain` lies above 1.",
+            "`plain` lies above 1."
+            if gains
+            else "No place has an attack of both kinds, so the last column is empty.",
         ),
         [
             *("environment", "condition", "`vary` keeps", "95 % interval", "aim"),
-            *("`plain` keeps", "the same without objects"),
+            *("`plain` keeps", "the same, no objects"),
             "error of `vary` to `plain`, 95 % interval",
         ],
         rows,
@@ -79,7 +81,8 @@ def light(drives: pd.DataFrame) -> Finding:
         "own = drives.query(\"case == 'attack'\")\n"
         'print(own.pivot_table("cross_track_mean_m", "environment", "condition"))',
         (
-            "We set the aims before the first result.",
+            "The aim is the least share that `vary` should keep. We set the aims "
+            "before the first result.",
             "In `mujoco`, the car stands on wheels, and its steering lags.",
             _stayed(drives, kept),
         ),
@@ -96,9 +99,10 @@ def _stayed(drives: pd.DataFrame, kept: pd.DataFrame) -> str:
     stays = left & ~there
     others = math.exp(by_day[where][~stays].mean())
     return (
-        f"A few places decide about a mean: by day, {left.sum()} cars leave the lane "
-        f"in the surrogate, and {stays.sum()} of them stay in the lane in `{where}`. "
-        f"The attacks at the other {(~stays).sum()} places keep {others:.2f}."
+        f"A few places decide about a mean: in the surrogate by day, the car leaves "
+        f"the lane at {left.sum()} places. In `{where}`, it stays in the lane at "
+        f"{stays.sum()} of them. The attacks at the other {(~stays).sum()} places keep "
+        f"{others:.2f} there."
     )
 
 

@@ -210,10 +210,8 @@ def test_light_counts_aims_and_where_varying_helps():
         assert ends in (f"{kept} to {kept}", f"{kept} to {float(kept) + 0.01:.2f}")
     assert {row[7] for row in found.rows} == {"2.00 to 2.01"}
     threat = found.threats[-1]
-    assert "2 cars leave the lane in the surrogate, and 2 of them stay" in threat
-    assert (
-        "in `mujoco_built_in`. The attacks at the other 3 places keep 0.72." in threat
-    )
+    assert "leaves the lane at 2 places" in threat and "lane at 2 of them" in threat
+    assert threat.endswith("The attacks at the other 3 places keep 0.72 there.")
     alone = made("light", rows[rows["attack"].str.contains("vary")])
     assert "`vary` helps in 0" in alone.title
     assert "0 attacks with `plain`" in alone.sentences[0]
