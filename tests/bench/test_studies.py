@@ -196,7 +196,8 @@ def test_light_counts_aims_and_where_varying_helps():
     where |= {("mujoco_built_in", "day"): 0.72, ("mitsuba", "evening"): 0.59}
     rows = light_rows({"plain": 1.0, "vary": 2.0}, where)
     found = made("light", rows)
-    assert "in 1 of 3 environments and conditions; `vary` helps in 3" in found.title
+    assert "helps attacks in 3 of 3" in found.title and "aim in 1" in found.title
+    assert found.sentences[1].endswith("`plain` reaches the aim in 1 rows.")
     assert "5 attacks with `vary` and 5 attacks with `plain`" in found.sentences[0]
     missed = "misses it in `mitsuba` day, `mitsuba` evening."
     assert missed in found.sentences[1] and "in 1 of 3 rows" in found.sentences[1]
@@ -213,7 +214,7 @@ def test_light_counts_aims_and_where_varying_helps():
     assert "leaves the lane at 2 places" in threat and "lane at 2 of them" in threat
     assert threat.endswith("The attacks at the other 3 places keep 0.72 there.")
     alone = made("light", rows[rows["attack"].str.contains("vary")])
-    assert "`vary` helps in 0" in alone.title
+    assert "helps attacks in 0 of 3" in alone.title
     assert "0 attacks with `plain`" in alone.sentences[0]
     assert {row[7] for row in alone.rows} == {"–"}
 

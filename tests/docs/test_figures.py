@@ -127,11 +127,24 @@ def test_patches_of_two_resolutions_equal_their_rows(name, pixels):
 
 def test_what_varied_attacks_keep_equals_their_rows():
     rows = light(pd.read_csv(ROOT / "bench/light_transfer/drives.csv")).rows
-    kept = {row[0]: row[2] for row in rows if row[1] == "day"}
+    by_day = {row[0]: row for row in rows if row[1] == "day"}
     text = " ".join((ROOT / "docs/howto/robust.md").read_text("utf-8").split())
-    scene, car = kept["mitsuba_built_in"], kept["mujoco_built_in"]
-    assert f"kept {scene} of their error when the path-traced scene lit" in text
-    assert f"but only {car} with MuJoCo's car there" in text
+    for column, words in (
+        (
+            5,
+            "such attacks kept {} of their error when the path-traced scene lit the "
+            "objects, and {} with MuJoCo's car there",
+        ),
+        (
+            2,
+            "attacks kept {} of their error when the path-traced scene lit the "
+            "objects, but only {} with MuJoCo's car there",
+        ),
+    ):
+        cells = (by_day[f"{name}_built_in"][column] for name in ("mitsuba", "mujoco"))
+        assert words.format(*cells) in text
+    assert len(rows) == 16 and all(float(row[7].split()[0]) <= 1 for row in rows)
+    assert "In none of 16 environments and lights is the difference shown" in text
 
 
 def test_the_table_of_coarse_colours_equals_its_rows():
