@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from bench.results import Comparison, Progress, compare, cpu_seconds
+from bench.results import Comparison, Progress, compare, timed
 from bench.tables import markdown
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy
 from mi_nerfattack.commands.shared.terminal import Result
@@ -176,7 +176,7 @@ def _psnr(error: np.ndarray) -> float:
 
 def _seconds(work: Callable[[], Any], repeats: int) -> float:
     """Return the median of the processor times, after a first one that compiles."""
-    times = [cpu_seconds(lambda: dr.eval(work())) for _ in range(repeats + 1)]
+    times = [timed(lambda: dr.eval(work())) for _ in range(repeats + 1)]
     return statistics.median(times[1:])
 
 

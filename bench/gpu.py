@@ -127,7 +127,9 @@ class BenchFrames:
         sensor, one = _sensor(Job(*size, 1, 1)), to_state(Job(*size, 1, 1).initial())
 
         def latency() -> float:
-            return _seconds(lambda: sensor.observe(one, 0).image.numpy())
+            return results.timed(
+                lambda: sensor.observe(one, 0).image.numpy(), time.perf_counter
+            )
 
         latency()  # compiles
         seconds = [latency() for _ in range(self.repeats)]
@@ -236,7 +238,10 @@ def _row(sensor: SceneSensor, state: Any, repeats: int) -> dict[str, float]:
     dr.sync_thread()
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
-    seconds = [_seconds(lambda: sensor.observe(state, 0)) for _ in range(repeats)]
+    seconds = [
+        results.timed(lambda: sensor.observe(state, 0), time.perf_counter)
+        for _ in range(repeats)
+    ]
     count, median = dr.width(state), statistics.median(seconds)
     peak = dr.detail.malloc_watermark(dr.backend_v(mi.Float))
     return {
@@ -245,14 +250,6 @@ def _row(sensor: SceneSensor, state: Any, repeats: int) -> dict[str, float]:
         "frames_per_s": count / median,
         "drjit_peak_memory_mb": peak / 1e6,
     }
-
-
-def _seconds(action: Callable[[], Any]) -> float:
-    dr.sync_thread()
-    start = time.perf_counter()
-    action()
-    dr.sync_thread()
-    return time.perf_counter() - start
 
 
 def frame_lines(document: dict[str, Any]) -> list[str]:

@@ -99,13 +99,15 @@ def compare(
     return Result(document, lambda: print(*lines(document), sep="\n"))
 
 
-def cpu_seconds(work: Callable[[], Any]) -> float:
-    """Return the processor time of work, with the kernels that it launched."""
+def timed(
+    work: Callable[[], Any], clock: Callable[[], float] = time.process_time
+) -> float:
+    """Return the time of work, with the kernels that it launched."""
     dr.sync_thread()
-    start = time.process_time()
+    start = clock()
     work()
     dr.sync_thread()
-    return time.process_time() - start
+    return clock() - start
 
 
 def machine() -> dict[str, Any]:

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from bench.results import Comparison, Progress, compare, cpu_seconds, read_sizes
+from bench.results import Comparison, Progress, compare, read_sizes, timed
 from bench.tables import markdown
 from mi_nerfattack.commands.shared.terminal import Result
 from mi_nerfattack.ranges import Count
@@ -63,7 +63,7 @@ def measure(options: BenchSplats, folder: Path, show: Progress) -> dict[str, Any
             show(f"splats {text}", turn, WARM_UP + options.repeats, "")
             for name, tasks in sides.items():
                 for task, work in tasks.items():
-                    turns.setdefault(f"{name}_{task}", []).append(cpu_seconds(work))
+                    turns.setdefault(f"{name}_{task}", []).append(timed(work))
         row = {k: statistics.median(v[WARM_UP:]) for k, v in turns.items()}
         for task in ("frame", "gradient"):
             peer = row[f"volprim_rf_basic_{task}"]

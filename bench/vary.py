@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bench.results import Comparison, Progress, compare, cpu_seconds
+from bench.results import Comparison, Progress, compare, timed
 from bench.tables import markdown
 from mi_nerfattack.attack.base import AbstractAttack
 from mi_nerfattack.commands.shared.terminal import Result
@@ -56,7 +56,7 @@ def measure(options: BenchVary, folder: Path, show: Progress) -> dict[str, Any]:
     for turn in range(WARM_UP + options.repeats):
         show("vary", turn, WARM_UP + options.repeats, "")
         for part, attack in attacks.items():
-            turns[part].append(cpu_seconds(attack.step))
+            turns[part].append(timed(attack.step))
     medians = {part: statistics.median(some[WARM_UP:]) for part, some in turns.items()}
     rows = {
         part: {"iteration_cpu_s": seconds, "ratio": seconds / medians["nothing"]}

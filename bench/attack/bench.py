@@ -116,7 +116,6 @@ def _times(
         "iteration_over_rollout": kept / rollout,
         "replay_over_rollout": row["replay_seconds"] / rollout,
         "torch_time_ratio": row["torch_seconds"] / kept,
-        "torch_time_ratio_one_level": row["torch_seconds"] / row["one_level_seconds"],
         "torch_cpu_ratio": row["torch_cpu_seconds"] / row[f"{WAYS[0]}_cpu_seconds"],
     }
 

@@ -37,9 +37,7 @@ def light(drives: pd.DataFrame) -> Finding:
     shares, of_plain = _means(kept, VARY), _means(kept, PLAIN)
     bare, gains = _means(without.sub(base, axis=0), VARY), _gains(logs)
     ends_of_vary = _ends(kept, VARY)
-    aims = {
-        place: AIMS[place[0]] if place[1] == "day" else _OTHER_LIGHT for place in shares
-    }
+    aims = {(x, y): AIMS[x] if y == "day" else _OTHER_LIGHT for x, y in shares}
     rows = []
     for place, share in shares.items():
         figures = share, aims[place], of_plain.get(place), bare.get(place)
@@ -48,8 +46,7 @@ def light(drives: pd.DataFrame) -> Finding:
         rows.append([*place, *cells, ends_cell(gains.get(place), 2)])
     missed = [f"`{x}` {y}" for (x, y), aim in aims.items() if shares[x, y] < aim]
     reached = sum(of_plain[place] >= aims[place] for place in of_plain)
-    known = filter(None, (gains.get(place) for place in shares))
-    helps = sum(low > 1 for low, _ in known)
+    helps = sum(low > 1 for low, _ in filter(None, map(gains.get, shares)))
     heat: Any = pd.Series(shares).unstack(sort=False)
     count, met = len(shares), len(shares) - len(missed)
     of_method = with_labels(drives).groupby("method")["attack"].nunique()
