@@ -187,10 +187,11 @@ def _cpu() -> str:
 
 
 def run_command(words: Sequence[str]) -> None:
-    """Run ``mi-nerfattack``, or ``python -m bench``, in a process of its own.
+    """Run ``mi-nerfattack``, ``python -m bench`` or ``python`` in another process.
 
     Args:
-        words: of its command line; the first one is ``bench`` for a benchmark.
+        words: of its command line; the first one is ``bench`` for a benchmark, and
+            ``python`` for a script or another module.
 
     Raises:
         SystemExit: with its exit code, if it fails.
@@ -210,8 +211,11 @@ def run_for_output(words: Sequence[str]) -> tuple[int, str]:
 
 
 def _run(words: Sequence[str], stdout: int | None) -> subprocess.CompletedProcess[str]:
-    is_bench, own = words[0] == "bench", ["mi-nerfattack", *words]
-    print("$", shlex.join(words if is_bench else own), file=sys.stderr, flush=True)
-    module = list(words) if is_bench else ["mi_nerfattack.cli", *words]
-    command = [sys.executable, "-m", *module]
+    first = {"bench": ("-m", "bench"), "python": ()}.get(words[0])
+    shown = words if first is not None else ("mi-nerfattack", *words)
+    print("$", shlex.join(shown), file=sys.stderr, flush=True)
+    rest = (
+        ("-m", "mi_nerfattack.cli", *words) if first is None else (*first, *words[1:])
+    )
+    command = [sys.executable, *rest]
     return subprocess.run(command, check=False, stdout=stdout, text=True)

@@ -31,6 +31,7 @@ from bench.studies.content import (
 )
 from bench.studies.light import light
 from bench.studies.limits import limits
+from bench.studies.parts import parts
 from bench.studies.plan import Study, state
 from bench.studies.transfer import transfer
 from mi_nerfattack.drives.table import records, with_starts
@@ -145,6 +146,13 @@ def attack(drives: pd.DataFrame) -> Finding:
         'print(deployed.groupby(["route", "case"]).cross_track_mean_m.mean())',
         tuple(_threats_to_attack(by_case, found)),
     )
+
+
+def country(drives: pd.DataFrame) -> Finding:
+    """Do the same as `attack` at the second place, with its policy."""
+    made = attack(drives)
+    title = made.title[0].lower() + made.title[1:]
+    return replace(made, title=f"At a second place, with another policy, {title}")
 
 
 def _threats_to_attack(
@@ -351,7 +359,9 @@ FINDINGS: dict[str, tuple[str, Callable[[pd.DataFrame], Finding]]] = {
     "flat": ("whether flat objects mislead the policy", flat),
     "transfer": ("whether attacks transfer", transfer),
     "light": ("whether attacks survive other light and wheels", light),
+    "parts": ("which part of `vary` helps", parts),
     "limits": ("what limits attacks", limits),
+    "country": ("whether the attack works at a second place", country),
 }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pandas as pd
 from pydantic import Field, ValidationError, model_validator
@@ -34,10 +34,10 @@ UNKNOWN = "unknown"
 
 
 class Input(Section):
-    """A file that studies read and one command makes."""
+    """A file that studies read, and the commands that make it."""
 
     file: str
-    command: str
+    commands: Annotated[tuple[str, ...], Field(min_length=1)]
 
 
 class Study(Section):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import pytest
 
@@ -110,6 +111,11 @@ def test_the_output_of_a_command_that_fails_is_returned():
     assert code == 2 and text == ""
 
 
+def test_a_script_runs_with_this_python():
+    code, text = run_for_output(["python", "-c", "import sys; print(sys.executable)"])
+    assert (code, text.strip()) == (0, sys.executable)
+
+
 def test_a_check_makes_missing_inputs_first(studies, tmp_path, monkeypatch, capsys):
     commands = []
 
@@ -117,7 +123,7 @@ def test_a_check_makes_missing_inputs_first(studies, tmp_path, monkeypatch, caps
         commands.append(words)
         raise SystemExit(3)
 
-    item = plan.Input(file="build/bricks", command="bake base -o build/bricks")
+    item = plan.Input(file="build/bricks", commands=("bake base -o build/bricks",))
     monkeypatch.setattr(
         run, "read_plan", lambda: plan.Plan(inputs=(item,), studies=(studies[0],))
     )

@@ -219,6 +219,37 @@ def test_light_counts_aims_and_where_varying_helps():
     assert {row[7] for row in alone.rows} == {"–"}
 
 
+def test_the_second_place_has_the_rule_of_the_first():
+    cases = ("no_object", "random", "best_random", "attack")
+    errors = {case: [0.1 + 0.1 * k] * 6 for k, case in enumerate(cases)}
+    rows = drives(table(errors), table(errors).assign(environment="mitsuba"))
+    found = made("country", rows)
+    assert found.title.startswith("At a second place") and "6 of 6" in found.title
+    assert found.rows == made("attack", rows).rows
+
+
+def test_the_parts_of_varying_are_compared_with_nothing():
+    sizes = {"none": 1.0, "light": 0.5, "camera": 2.0, "vehicle": 1.0, "coarse_16": 1.5}
+    rows = pd.DataFrame(
+        {"attack": f"{route}-cars-{method}-101-0", "route": route, "case": "attack"}
+        | {"environment": environment, "condition": "day"}
+        | {"cross_track_mean_m": size * share * error}
+        for method, size in sizes.items()
+        for route, error in (("left", 0.1), ("right", 0.4))
+        for environment, share in (("surrogate", 1.0), ("mitsuba", 0.5))
+    )
+    found = made("parts", rows)
+    assert "`camera` gives the largest error at 2 places, 2.00 times" in found.title
+    factors = ["0.50", "2.00", "1.00", "1.50"]
+    assert found.head[3:] == ["light", "camera", "vehicle", "all parts"]
+    assert found.rows == [
+        ["surrogate", "day", "0.200", *factors],
+        ["mitsuba", "day", "0.100", *factors],
+    ]
+    assert "0.50 with `light`" in found.sentences[0]
+    assert "`camera` in 2, `vehicle` in 0" in found.sentences[1]
+
+
 def test_limits_counts_places_beyond_the_lane():
     rows = [
         {"place": f"{route}-{kind}-{seed}", "pixels": 10, "moved": 0.1 * number}

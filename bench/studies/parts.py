@@ -1,0 +1,54 @@
+"""The finding about the parts of `vary`: what each one gives in other environments."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pandas as pd
+
+from bench.studies.charts import draw_searches
+from bench.studies.content import ERROR, Finding, with_labels
+from mi_nerfattack.rollout.drive import ATTACK
+
+NONE = "none"
+#: Methods of bench/vary_parts.toml, and of bench/resolution.toml with all parts.
+PARTS = {NONE: "nothing", "light": "light", "camera": "camera", "vehicle": "vehicle"}
+PARTS |= {"coarse_16": "all parts"}
+
+
+def parts(drives: pd.DataFrame) -> Finding:
+    """Compare each part with the attack that varies nothing."""
+    own = with_labels(drives[drives["case"] == ATTACK])
+    own = own.assign(part=own["method"].map(PARTS), log=own[ERROR].map(math.log))
+    named = [name for name in PARTS.values() if name in set(own["part"])]
+    where = ["environment", "condition"]
+    logs: Any = own.pivot_table("log", where, "part", sort=False)[named]
+    gains = logs.drop(columns=PARTS[NONE]).sub(logs[PARTS[NONE]], axis=0)
+    means, places = gains.mean().map(math.exp), own[["route", "seed"]].drop_duplicates()
+    errors: Any = own.pivot_table("log", "part", "route", sort=False).loc[named]
+    rows = [
+        [*place, f"{math.exp(logs.loc[place, PARTS[NONE]]):.3f}"]
+        + [f"{math.exp(gain):.2f}" for gain in gains.loc[place]]
+        for place in logs.index
+    ]
+    best, shares = means.idxmax(), [f"{x:.2f} with `{n}`" for n, x in means.items()]
+    above = [f"`{name}` in {(gains[name] > 0).sum()}" for name in gains.columns]
+    return Finding(
+        f"Of the parts of `vary`, `{best}` gives the largest error at {len(places)} "
+        f"places, {means[best]:.2f} times the error without any part",
+        (
+            f"The error in {len(logs)} environments and lights, divided by the error "
+            "of an attack that varies nothing, is "
+            f"{', '.join(shares[:-1])} and {shares[-1]} (geometric mean).",
+            f"The ratio is above 1 for {', '.join(above)} of {len(logs)} rows.",
+            f"The rows are geometric means over {len(places)} places with one start "
+            "each. These are too few for an interval, so the order of the parts is "
+            "uncertain.",
+        ),
+        ["environment", "condition", "nothing (m)", *gains.columns],
+        rows,
+        lambda figure: draw_searches(figure, errors.map(math.exp)),
+        "attacks = drives.query(\"case == 'attack'\").copy()\n"
+        'print(attacks.groupby(["attack", "environment"]).cross_track_mean_m.mean())',
+    )
