@@ -146,11 +146,10 @@ class Evaluate:
         from mi_nerfattack.scenario.world import at_own_speed
 
         file = PolicyFile.read(self.policy, self.settings)
-        is_chosen = self.where != PlaceOptions()
         section, under = file.section, self._environments()
-        place = file.place(self.where.build(), is_chosen)
+        place = file.place(self.where)
         file.check_wheels("--environments", self.environments)
-        own = file.scenario is not None and not is_chosen
+        own = file.scenario is not None and not self.where.names_place
         routes, settings = self._routes(place.routes, file), self._settings(place, own)
         if file.vehicle is not None:
             motion = file.vehicle.motion()
@@ -191,7 +190,9 @@ class Evaluate:
         names = self.routes
         if names:
             _check_different("--routes", names)
-        elif file.scenario is not None and self.where == PlaceOptions():
+        elif file.scenario is not None and not (
+            self.where.names_place or self.where.routes_file
+        ):
             names = (file.scenario.scene.route,)
         if path.suffix == ".xml":
             return self._leaderboard(path)

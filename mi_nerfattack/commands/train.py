@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -48,7 +48,7 @@ class Train:
     frames_only: bool = False
     """Collect frames and train no policy."""
     like: str | None = None
-    """TOML file of evaluate: its camera and vehicle."""
+    """TOML file of evaluate: its camera, vehicle and scene."""
     settings: Settings = ()
     """Set a key of that file: vehicle.trust_code=true."""
     preset: str = "laptop"
@@ -219,15 +219,16 @@ class Train:
     def _place(self, preset: Preset, file: PolicyFile) -> Place:
         from mi_nerfattack.deploy.place import bundled_place
 
-        options = self.scene, self.field, self.routes_file, self.object
-        place = PlaceOptions(
-            place=preset.place,
+        options = PlaceOptions(
+            place=preset.place if file.scenario is None else None,
             scene=self.scene,
             field=self.field,
             routes_file=self.routes_file,
-            object=self.object or bundled_place(preset.place).objects,
-        ).build()
-        return file.place(place, is_chosen=any(options))
+            object=self.object,
+        )
+        place = file.place(options)
+        objects = place.objects or bundled_place(preset.place).objects
+        return replace(place, objects=objects)
 
     def _routes(self, place: Place, file: PolicyFile) -> list[Route]:
         from mi_nerfattack.scenario.world import at_own_speed
@@ -274,8 +275,6 @@ class Train:
         ]
 
     def _settings(self, preset: Preset, place: Place) -> ImitationSettings:
-        from dataclasses import replace
-
         from mi_nerfattack.training.presets import evaluation_for
         from mi_nerfattack.training.settings import ImitationSettings
         from mi_nerfattack.training.train import TrainSettings
@@ -312,8 +311,6 @@ class Train:
 
     def _preset(self) -> Preset:
         """Return the preset with what is given in place of its own."""
-        from dataclasses import replace
-
         from mi_nerfattack.training.presets import find_preset
 
         names = (

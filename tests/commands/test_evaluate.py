@@ -18,7 +18,6 @@ from mi_nerfattack.commands.evaluate import Evaluate
 from mi_nerfattack.commands.shared.evaluate_options import PlaceOptions
 from mi_nerfattack.commands.shared.options import command_line
 from mi_nerfattack.commands.shared.policy_file import PolicyFile
-from mi_nerfattack.deploy.place import bundled_place
 from mi_nerfattack.deploy.registry import make_environment
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation import work as evaluate_work
@@ -293,6 +292,14 @@ def test_a_scenario_is_driven_in_its_own_scene(place, monkeypatch, capsys):
     assert seen[0].field.name == "scene.safetensors"
     assert [path.name for path in seen[0].objects] == ["object.safetensors"]
     assert seen[0].car.control_unit == "rad" and seen[0].motion is not None
+    # other objects stand in the scenario's scene, too
+    seen.clear()
+    save_field("mine.safetensors", places.small_grid())
+    assert cli.main([*own, *short, "--object", "mine.safetensors"]) == 0
+    assert list(json.loads(capsys.readouterr().out)["mitsuba"]) == ["lane"]
+    assert seen[0].scene.name == "deployment.xml"
+    assert [path.name for path in seen[0].objects] == ["mine.safetensors"]
+    # another scene
     seen.clear()
     assert cli.main([*command, *short]) == 0
     assert list(json.loads(capsys.readouterr().out)["mitsuba"]) == ["straight", "lane"]
@@ -309,7 +316,7 @@ def test_the_field_stands_where_the_scenario_puts_it(tmp_path, to_world):
         table["scene"]["to_world"] = to_world
     path = tmp_path / "scenario.toml"
     path.write_text(tomlkit.dumps(table), encoding="utf-8")
-    place = PolicyFile.read(str(path)).place(bundled_place("intersection"), False)
+    place = PolicyFile.read(str(path)).place(PlaceOptions())
     assert place.field == bundled("room/field.safetensors")
     assert (place.field_pose is None) == (to_world is None)
     if place.field_pose is not None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
+    from mi_nerfattack.commands.shared.evaluate_options import PlaceOptions
     from mi_nerfattack.deploy.place import Place
     from mi_nerfattack.render.camera.rig import Rig
     from mi_nerfattack.scenario.policy.base import AbstractPolicySection
@@ -138,43 +139,51 @@ class PolicyFile:
                 "that of a custom vehicle; leave it out"
             )
 
-    def place(self, place: Place, is_chosen: bool) -> Place:
+    def place(self, options: PlaceOptions) -> Place:
         """Return where the policy drives, with its camera and its car.
 
+        A scenario is driven in its scene, with what the options name instead of its
+        field, routes or objects, unless they name another place.
+
         Args:
-            place: of the command's options.
-            is_chosen: whether these name one; otherwise it is the scenario's.
+            options: of the command.
 
         Raises:
             InputError: the scenario's surrogate is a Mitsuba scene.
         """
-        if self.scenario is not None and not is_chosen:
-            from mi_nerfattack.fields.io import holds_splats
-
-            scene = self.scenario.scene
-            if scene.surrogate is not None:
-                raise InputError(
-                    f"scene.surrogate: {scene.surrogate}: a Mitsuba scene, which tells "
-                    "no camera to other environments; give --scene, --routes-file and "
-                    "the policy in a file with [policy] and [camera]"
-                )
-            field = None if scene.field is None else scene.field.file
-            if field and holds_splats(field):
-                field = None
-            place = replace(
-                place,
-                scene=scene.deployment.file,
-                field=field,
-                field_pose=None if scene.to_world is None else scene.pose,
-                routes=scene.routes.file,
-                objects=tuple(self._object_files()),
-            )
+        is_own = self.scenario is not None and not options.names_place
+        place = options.build(self._own_place() if is_own else None)
         if self.rig is not None:
             place = place.with_rig(self.rig)
         if self.vehicle is not None:
             car, period = self.vehicle.car(), self.vehicle.dt_s
             place = replace(place, car=car, period=period)
         return place
+
+    def _own_place(self) -> Place:
+        """Return the scenario's place, with camera and car of the bundled one."""
+        from mi_nerfattack.deploy.place import bundled_place
+        from mi_nerfattack.fields.io import holds_splats
+
+        assert self.scenario is not None
+        scene = self.scenario.scene
+        if scene.surrogate is not None:
+            raise InputError(
+                f"scene.surrogate: {scene.surrogate}: a Mitsuba scene, which tells "
+                "no camera to other environments; give --scene, --routes-file and "
+                "the policy in a file with [policy] and [camera]"
+            )
+        field = None if scene.field is None else scene.field.file
+        if field and holds_splats(field):
+            field = None
+        return replace(
+            bundled_place("intersection"),
+            scene=scene.deployment.file,
+            field=field,
+            field_pose=None if scene.to_world is None else scene.pose,
+            routes=scene.routes.file,
+            objects=tuple(self._object_files()),
+        )
 
     def _object_files(self) -> Iterator[Path]:
         """Yield the field files of the scenario's objects.
