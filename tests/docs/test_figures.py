@@ -22,10 +22,9 @@ FIGURES = files.read_toml(ROOT / "bench/figures.toml")
 PENDING = {
     "docs/results/attack_speed.md": 1,
     "docs/results/attack_size.md": 1,
-    "docs/results/photographs.md": 2,
+    "docs/results/photographs.md": 1,
     "docs/results/fields.md": 2,
     "docs/results/retrain.md": 4,
-    "docs/explain/environments.md": 1,
 }
 
 
