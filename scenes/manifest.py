@@ -23,6 +23,8 @@ from .listing import MANIFEST, ROOT, data_files
 BUDGET_MB = {
     "intersection/field.safetensors": 5.5,
     "room/field.safetensors": 3.5,
+    "country/field.safetensors": 5.5,
+    "country/two_cameras.safetensors": 1.7,
     "car/field.safetensors": 10,
     "policy/pilotnet.safetensors": 6.5,
     "room/policy.safetensors": 6.5,

@@ -11,6 +11,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from safetensors.torch import load_file
 from support.pages.blocks import fenced
 
 from mi_nerfattack.experiment.sweep.table import read_table
@@ -46,6 +47,11 @@ def printed(name: str, folder: Path) -> list[float]:
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
 def test_examples_are_short(script):
     assert len(script.read_text("utf-8").splitlines()) <= 60
+
+
+def test_the_bundled_weights_fit_the_network_of_two_cameras():
+    network = runpy.run_path(str(DOCS / "examples/two_cameras.py"))["Net"]()
+    network.load_state_dict(load_file(bundled("country/two_cameras.safetensors")))
 
 
 def test_tables_user(tmp_path):
