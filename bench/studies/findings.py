@@ -130,10 +130,10 @@ def attack(drives: pd.DataFrame) -> Finding:
             f"{found.other:.3f} m (ratio {found.ratio:.1f}, "
             f"{interval_words(found.ratio_ci95, 1)}).",
             f"The attack is farther at {places}. At {out} of {found.attacks} places, "
-            "the attack keeps a wheel out of the lane for 1 s or more, on average over "
-            "the drives of the place (share: "
+            "a wheel is out of the lane for 1 s or more with the attack, on average "
+            "over the drives (share: "
             f"{interval_words(share_interval(out, found.attacks), 2)}).",
-            f"The mean difference is {found.difference:.3f} m, and its standard "
+            f"The difference is {found.difference:.3f} m on average. Its standard "
             f"deviation between the places of a route is {metres(found.spread)}.",
         ),
         [
@@ -152,7 +152,7 @@ def country(drives: pd.DataFrame) -> Finding:
     """Do the same as `attack` at the second place, with its policy."""
     made = attack(drives)
     title = made.title[0].lower() + made.title[1:]
-    return replace(made, title=f"At a second place, with another policy, {title}")
+    return replace(made, title=f"On a country road, with another policy, {title}")
 
 
 def _threats_to_attack(
@@ -179,12 +179,12 @@ def _threats_to_attack(
     yield (
         "The worst random texture is the one with the largest error in the surrogate. "
         f"The random textures cost {cost:,} frames, and the attack up to {most:,}, so "
-        f"they had {100 * cost / most:.0f} % of its budget. [The page about the "
-        "gradient](gradient.md) compares at equal cost."
+        f"they had {100 * cost / most:.0f} % of its budget. At the intersection, "
+        "[another study](gradient.md) compares at equal cost."
     )
     left = own.groupby("route", sort=False)["departed"].agg(["sum", "size"])
     counts = ", ".join(f"{route} {x} of {n}" for route, x, n in left.itertuples())
-    yield f"By route, so many drives with the attack leave the lane: {counts}."
+    yield f"Drives with the attack that leave the lane, by route: {counts}."
     means = _by_place(own)
     yield (
         f"One place, {_name(means.idxmax())}, has a mean error of {means.max():.2f} m. "

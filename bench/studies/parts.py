@@ -11,10 +11,10 @@ from bench.studies.charts import draw_searches
 from bench.studies.content import ERROR, Finding, with_labels
 from mi_nerfattack.rollout.drive import ATTACK
 
-NONE = "none"
+NONE, ALL = "none", "all parts"
 #: Methods of bench/vary_parts.toml, and of bench/resolution.toml with all parts.
 PARTS = {NONE: "nothing", "light": "light", "camera": "camera", "vehicle": "vehicle"}
-PARTS |= {"coarse_16": "all parts"}
+PARTS |= {"coarse_16": ALL}
 
 
 def parts(drives: pd.DataFrame) -> Finding:
@@ -32,11 +32,12 @@ def parts(drives: pd.DataFrame) -> Finding:
         + [f"{math.exp(gain):.2f}" for gain in gains.loc[place]]
         for place in logs.index
     ]
-    best, shares = means.idxmax(), [f"{x:.2f} with `{n}`" for n, x in means.items()]
+    best = means.drop(ALL).idxmax()
+    shares = [f"{x:.2f} with `{name}`" for name, x in means.items()]
     above = [f"`{name}` in {(gains[name] > 0).sum()}" for name in gains.columns]
     return Finding(
-        f"Of the parts of `vary`, `{best}` gives the largest error at {len(places)} "
-        f"places, {means[best]:.2f} times the error without any part",
+        f"{len(places)} places do not show which part of `vary` helps: on average, "
+        f"`{best}` has the largest error, {means[best]:.2f} times that without a part",
         (
             f"The error in {len(logs)} environments and lights, divided by the error "
             "of an attack that varies nothing, is "

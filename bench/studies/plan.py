@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import pandas as pd
 from pydantic import Field, ValidationError, model_validator
@@ -34,10 +34,10 @@ UNKNOWN = "unknown"
 
 
 class Input(Section):
-    """A file that studies read, and the commands that make it."""
+    """A file that studies read and one command makes."""
 
     file: str
-    commands: Annotated[tuple[str, ...], Field(min_length=1)]
+    command: str
 
 
 class Study(Section):

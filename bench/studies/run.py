@@ -183,13 +183,11 @@ class BenchResults:
 def _make_inputs(study: Study) -> None:
     """Make the files that a study reads and that are missing."""
     for item in read_plan().inputs:
-        if item.file not in study.inputs or (ROOT / item.file).exists():
-            continue
-        for command in item.commands:
+        if item.file in study.inputs and not (ROOT / item.file).exists():
             try:
-                run_command(shlex.split(command))
+                run_command(shlex.split(item.command))
             except SystemExit as err:
-                why = f"{item.file}: {command!r} ended with {err.code}"
+                why = f"{item.file}: {item.command!r} ended with {err.code}"
                 raise InputError(why) from err
 
 

@@ -56,7 +56,7 @@ class Evaluate:
     environments: tuple[str, ...] = ("surrogate", "mitsuba", "mujoco")
     """Of surrogate, mitsuba, mujoco, mujoco_gl, and carla (needs --server)."""
     routes: tuple[str, ...] = ()
-    """Routes by name; all by default."""
+    """Routes by name; all by default, or the route of a scenario."""
     runs: int = 20
     """Drives of each case, environment and route."""
     objects: tuple[int, ...] = (1,)
@@ -149,7 +149,7 @@ class Evaluate:
         section, under = file.section, self._environments()
         place = file.place(self.where)
         file.check_wheels("--environments", self.environments)
-        own = file.scenario is not None and not self.where.names_place
+        own = file.keeps_place(self.where)
         routes, settings = self._routes(place.routes, file), self._settings(place, own)
         if file.vehicle is not None:
             motion = file.vehicle.motion()
@@ -190,9 +190,8 @@ class Evaluate:
         names = self.routes
         if names:
             _check_different("--routes", names)
-        elif file.scenario is not None and not (
-            self.where.names_place or self.where.routes_file
-        ):
+        elif file.keeps_place(self.where) and self.where.routes_file is None:
+            assert file.scenario is not None
             names = (file.scenario.scene.route,)
         if path.suffix == ".xml":
             return self._leaderboard(path)

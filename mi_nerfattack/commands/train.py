@@ -58,9 +58,9 @@ class Train:
     field: Path | None = None
     """Field file of the scene, for the surrogate."""
     object: tuple[Path, ...] = ()
-    """Grid fields at the roadside; the bundled hydrant."""
+    """Grid fields at the roadside; by default the place's."""
     routes_file: Path | None = None
-    """Routes file (.json); the preset's by default."""
+    """Routes file (.json); by default the place's."""
     frames: dict[str, int] | None = None
     """Frames by environment: surrogate 4096 mitsuba 6144."""
     validation_frames: dict[str, int] | None = None

@@ -4,9 +4,9 @@ Run ``python -m mi_nerfattack.scenes.country.build -o FOLDER [--seed N]``. The s
 gives the same bytes.
 """
 
-# The rule of this place: it is used once. Nothing is tuned on it: no training, no
-# setting of an attack, no environment. A study settles all of these at other places and
-# then measures here, one time. So its results do not rest on one town.
+# The rule of this place: it is used once. No setting of a training, an attack or an
+# environment is chosen here. A study settles them at other places and then trains and
+# measures here, one time. So its results do not rest on one town.
 
 from __future__ import annotations
 

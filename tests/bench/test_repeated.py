@@ -123,7 +123,7 @@ def test_a_check_makes_missing_inputs_first(studies, tmp_path, monkeypatch, caps
         commands.append(words)
         raise SystemExit(3)
 
-    item = plan.Input(file="build/bricks", commands=("bake base -o build/bricks",))
+    item = plan.Input(file="build/bricks", command="bake base -o build/bricks")
     monkeypatch.setattr(
         run, "read_plan", lambda: plan.Plan(inputs=(item,), studies=(studies[0],))
     )

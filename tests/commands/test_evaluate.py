@@ -28,6 +28,8 @@ from mi_nerfattack.scenario.policy.kinds import HttpSection, ProgramSection
 from mi_nerfattack.scenes import bundled
 from mi_nerfattack.system.workers import InThisProcess, Processes
 
+ROOT = Path(__file__).parents[2]
+
 pytestmark = pytest.mark.usefixtures("variant")
 
 
@@ -304,6 +306,25 @@ def test_a_scenario_is_driven_in_its_own_scene(place, monkeypatch, capsys):
     assert cli.main([*command, *short]) == 0
     assert list(json.loads(capsys.readouterr().out)["mitsuba"]) == ["straight", "lane"]
     assert seen[0].scene.name == "scene.xml" and seen[0].car.control_unit == "rad"
+
+
+def test_options_replace_parts_of_a_scenarios_place():
+    room = PolicyFile.read(str(bundled("room.toml")))
+    whole = room.place(PlaceOptions())
+    for key, option in (("field", "field"), ("routes", "routes_file")):
+        changed = room.place(PlaceOptions(**{option: Path("mine")}))
+        assert changed == replace(whole, **{key: Path("mine")})
+    changed = room.place(PlaceOptions(object=(Path("mine"),)))
+    assert changed == replace(whole, objects=(Path("mine"),))
+    other = room.place(PlaceOptions(scene=Path("s.xml"), routes_file=Path("r.json")))
+    assert (other.scene, other.field, other.objects) == (Path("s.xml"), None, ())
+
+
+def test_files_of_objects_stand_for_a_scenarios_flat_objects():
+    flat = PolicyFile.read(str(ROOT / "docs/examples/flat.toml"))
+    with pytest.raises(InputError, match="a flat object without a file.*--object"):
+        flat.place(PlaceOptions())
+    assert flat.place(PlaceOptions(object=(Path("a"),))).objects == (Path("a"),)
 
 
 TURNED = [[0.0, -2.0, 0.0, 3.0], [2.0, 0.0, 0.0, -1.0], [0, 0, 2.0, 0], [0, 0, 0, 1]]

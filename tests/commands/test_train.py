@@ -18,6 +18,7 @@ from support.worlds.places import write_place
 import mi_nerfattack as nf
 from mi_nerfattack import cli
 from mi_nerfattack.commands.retrain import Retrain
+from mi_nerfattack.commands.shared.policy_file import PolicyFile
 from mi_nerfattack.commands.train import Train
 from mi_nerfattack.deploy.place import bundled_place
 from mi_nerfattack.experiment.retrain.solvable import drive_expert
@@ -25,6 +26,7 @@ from mi_nerfattack.experiment.transfer.found import read_found
 from mi_nerfattack.io import files
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.rollout.drive import departure_limit
+from mi_nerfattack.scenes import bundled
 from mi_nerfattack.training.presets import find_preset
 from mi_nerfattack.vehicle.expert import expert_for
 from mi_nerfattack.vehicle.route.route import load_routes
@@ -302,6 +304,18 @@ def test_frames_have_the_camera_and_the_vehicle_of_a_policys_file(
         if item.step:
             measured.append(item.speed.item())
     assert measured and measured == pytest.approx([6.0] * len(measured), rel=1e-5)
+
+
+@pytest.mark.parametrize("preset", ["laptop", "room"])
+def test_frames_come_from_the_place_of_a_scenario(preset):
+    """Also if options name other objects, but not if they name another scene."""
+    file, cube = PolicyFile.read(str(bundled("room.toml"))), (Path("mine"),)
+    kept = Train(Path("data"), preset=preset, object=cube)
+    place = kept._place(find_preset(preset), file)
+    assert place.scene == bundled("room/scene.xml") and place.objects == cube
+    there = replace(kept, scene=Path("s.xml"), routes_file=Path("r.json"), object=())
+    place = there._place(find_preset(preset), file)
+    assert place.scene == Path("s.xml") and place.field is None and place.objects
 
 
 def training(change: dict, vehicle: str = ACKERMANN):

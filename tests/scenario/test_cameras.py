@@ -9,8 +9,8 @@ from support.files.runs import HEAD, write_named_files
 from support.worlds.attacks import write_scenario
 
 from mi_nerfattack import cli
+from mi_nerfattack.commands.shared.evaluate_options import PlaceOptions
 from mi_nerfattack.commands.shared.policy_file import PolicyFile, read_camera
-from mi_nerfattack.deploy.place import bundled_place
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.transfer.columns import make_columns
 from mi_nerfattack.io import files
@@ -86,7 +86,7 @@ def test_a_policys_file_has_cameras_too(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(CAMERAS)
     assert PolicyFile.read(str(path)).rig == RIG
-    place = PolicyFile.read(str(path)).place(bundled_place(), False)
+    place = PolicyFile.read(str(path)).place(PlaceOptions())
     assert place.rig == RIG and place.camera == RIG.cameras[0]
     with pytest.raises(InputError, match="cameras: several; the car has one"):
         read_camera(str(path))

@@ -70,22 +70,22 @@ class PlaceOptions:
 
     @property
     def names_place(self) -> bool:
-        """Whether they name a place, and not only other parts of the usual one."""
+        """Whether they name a place, and not only parts of one."""
         return (self.place, self.scene, self.server) != (None, None, None)
 
-    def build(self, usual: Place | None = None) -> Place:
+    def build(self, base: Place | None = None) -> Place:
         """Return the place.
 
         Args:
-            usual: place whose parts count where no option names another one; by default
-                the bundled one, with its camera and car.
+            base: place whose parts the options replace; by default the bundled one,
+                with its camera and car.
 
         Raises:
             InputError: a scene has no routes.
         """
         from mi_nerfattack.deploy.place import bundled_place
 
-        place = usual or bundled_place(self.bundled)
+        place = base or bundled_place(self.bundled)
         if self.scene is not None:
             if self.routes_file is None:
                 raise InputError(f"--scene: {self.scene}; it needs its --routes-file")

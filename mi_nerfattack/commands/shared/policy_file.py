@@ -139,20 +139,25 @@ class PolicyFile:
                 "that of a custom vehicle; leave it out"
             )
 
+    def keeps_place(self, options: PlaceOptions) -> bool:
+        """Whether this is a scenario, and no option names another place."""
+        return self.scenario is not None and not options.names_place
+
     def place(self, options: PlaceOptions) -> Place:
         """Return where the policy drives, with its camera and its car.
 
-        A scenario is driven in its scene, with what the options name instead of its
-        field, routes or objects, unless they name another place.
+        Without --place, --scene and --server, a scenario keeps its place, and the other
+        options replace parts of this place.
 
         Args:
             options: of the command.
 
         Raises:
-            InputError: the scenario's surrogate is a Mitsuba scene.
+            InputError: the scenario's surrogate is a Mitsuba scene, or an object has no
+                file.
         """
-        is_own = self.scenario is not None and not options.names_place
-        place = options.build(self._own_place() if is_own else None)
+        base = self._own_place(options) if self.keeps_place(options) else None
+        place = options.build(base)
         if self.rig is not None:
             place = place.with_rig(self.rig)
         if self.vehicle is not None:
@@ -160,7 +165,7 @@ class PolicyFile:
             place = replace(place, car=car, period=period)
         return place
 
-    def _own_place(self) -> Place:
+    def _own_place(self, options: PlaceOptions) -> Place:
         """Return the scenario's place, with camera and car of the bundled one."""
         from mi_nerfattack.deploy.place import bundled_place
         from mi_nerfattack.fields.io import holds_splats
@@ -176,13 +181,14 @@ class PolicyFile:
         field = None if scene.field is None else scene.field.file
         if field and holds_splats(field):
             field = None
+        is_moved = field is not None and scene.to_world is not None
         return replace(
             bundled_place("intersection"),
             scene=scene.deployment.file,
             field=field,
-            field_pose=None if scene.to_world is None else scene.pose,
+            field_pose=scene.pose if is_moved else None,
             routes=scene.routes.file,
-            objects=tuple(self._object_files()),
+            objects=options.object or tuple(self._object_files()),
         )
 
     def _object_files(self) -> Iterator[Path]:
@@ -197,7 +203,7 @@ class PolicyFile:
                 raise InputError(
                     f"objects.{index}: a flat object without a file; places are drawn "
                     "for files: write one with 'mi-nerfattack asset flat', and name it "
-                    "as field"
+                    "as field, or as --object"
                 )
             yield item.named.file
 
