@@ -59,6 +59,22 @@ def test_the_table_of_rendering_equals_its_file():
             assert f"| {size} {name} | {figures} |" in text
 
 
+def test_the_figures_of_the_country_road_equal_their_files():
+    text = " ".join((ROOT / "docs/reference/places.md").read_text("utf-8").split())
+    place = ROOT / "bench/country_place"
+    card = files.read_json(place / "policy/card.json")
+    cases = [one.values() for routes in card.values() for one in routes.values()]
+    drives = [case for some in cases for case in some]
+    count = sum(case["n"] for case in drives)
+    departed = sum(case["drives_departed"] for case in drives)
+    mean = sum(case["n"] * case["cross_track_mean_m"] for case in drives) / count
+    words = f"in {departed} of {count} drives, and is {mean:.2f} m from the lane centre"
+    assert words in text
+    routes = files.read_json(place / "field/metrics.json")["routes"].values()
+    psnr = sum(route["psnr_mean_db"] for route in routes) / len(routes)
+    assert f"along both routes is about {psnr:.0f} dB" in text
+
+
 def test_the_table_of_the_demo_equals_its_rows():
     rows = read_table(ROOT / "bench/demo/results.csv")
     shown = {
