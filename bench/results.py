@@ -211,11 +211,9 @@ def run_for_output(words: Sequence[str]) -> tuple[int, str]:
 
 
 def _run(words: Sequence[str], stdout: int | None) -> subprocess.CompletedProcess[str]:
-    first = {"bench": ("-m", "bench"), "python": ()}.get(words[0])
-    shown = words if first is not None else ("mi-nerfattack", *words)
-    print("$", shlex.join(shown), file=sys.stderr, flush=True)
-    rest = (
-        ("-m", "mi_nerfattack.cli", *words) if first is None else (*first, *words[1:])
-    )
-    command = [sys.executable, *rest]
+    prefix = {"bench": ["-m", "bench"], "python": []}.get(words[0])
+    if prefix is None:
+        words, prefix = ["mi-nerfattack", *words], ["-m", "mi_nerfattack.cli"]
+    print("$", shlex.join(words), file=sys.stderr, flush=True)
+    command = [sys.executable, *prefix, *words[1:]]
     return subprocess.run(command, check=False, stdout=stdout, text=True)
