@@ -11,10 +11,15 @@ from bench.studies.charts import draw_searches
 from bench.studies.content import ERROR, Finding, with_labels
 from mi_nerfattack.rollout.drive import ATTACK
 
-NONE, ALL = "none", "all parts"
-#: Methods of bench/vary_parts.toml, and of bench/resolution.toml with all parts.
-PARTS = {NONE: "nothing", "light": "light", "camera": "camera", "vehicle": "vehicle"}
-PARTS |= {"coarse_16": ALL}
+NONE, ALL = "nothing", "all parts"
+#: What varies, by method of bench/vary_parts.toml; bench/resolution.toml has all parts.
+PARTS = {
+    "none": NONE,
+    "light": "light",
+    "camera": "camera",
+    "vehicle": "vehicle",
+    "coarse_16": ALL,
+}
 
 
 def parts(drives: pd.DataFrame) -> Finding:
@@ -24,11 +29,11 @@ def parts(drives: pd.DataFrame) -> Finding:
     named = [name for name in PARTS.values() if name in set(own["part"])]
     where = ["environment", "condition"]
     logs: Any = own.pivot_table("log", where, "part", sort=False)[named]
-    gains = logs.drop(columns=PARTS[NONE]).sub(logs[PARTS[NONE]], axis=0)
+    gains = logs.drop(columns=NONE).sub(logs[NONE], axis=0)
     means, places = gains.mean().map(math.exp), own[["route", "seed"]].drop_duplicates()
     errors: Any = own.pivot_table("log", "part", "route", sort=False).loc[named]
     rows = [
-        [*place, f"{math.exp(logs.loc[place, PARTS[NONE]]):.3f}"]
+        [*place, f"{math.exp(logs.loc[place, NONE]):.3f}"]
         + [f"{math.exp(gain):.2f}" for gain in gains.loc[place]]
         for place in logs.index
     ]
