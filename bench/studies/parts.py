@@ -12,13 +12,13 @@ from bench.studies.content import ERROR, Finding, with_labels
 from mi_nerfattack.rollout.drive import ATTACK
 
 NONE, ALL = "nothing", "all parts"
-#: What varies, by method of bench/vary_parts.toml; bench/resolution.toml has all parts.
+#: What varies, by method of bench/vary_parts.toml.
 PARTS = {
     "none": NONE,
     "light": "light",
     "camera": "camera",
     "vehicle": "vehicle",
-    "coarse_16": ALL,
+    "all": ALL,
 }
 
 

@@ -228,7 +228,7 @@ def test_the_second_place_has_the_rule_of_the_first():
 
 
 def test_the_parts_of_varying_are_compared_with_nothing():
-    sizes = {"none": 1.0, "light": 0.5, "camera": 2.0, "vehicle": 1.0, "coarse_16": 2.5}
+    sizes = {"none": 1.0, "light": 0.5, "camera": 2.0, "vehicle": 1.0, "all": 2.5}
     rows = pd.DataFrame(
         {"attack": f"{route}-cars-{method}-101-0", "route": route, "case": "attack"}
         | {"environment": environment, "condition": "day"}
