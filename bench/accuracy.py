@@ -20,7 +20,7 @@ from mi_nerfattack.fields import load_field, load_grid
 from mi_nerfattack.render.camera.intrinsics import from_fov, look_at
 from mi_nerfattack.render.camera.lens import generate_rays, pose_arrays
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.render.composite import AbstractComposite, DepthComposite, Seen
+from mi_nerfattack.render.composite import AbstractComposite, DepthComposite, Marches
 from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.render.march import march
 from mi_nerfattack.render.posed import PosedField
@@ -92,8 +92,8 @@ def _steps(
         for factor in FACTORS:
             field.refine(own / factor)
             posed = PosedField(field)
-            seen = composite.render([posed], rays, STOP)
-            row[f"psnr_db_{factor}"] = _psnr(_picture(seen, [posed], rays) - exact)
+            marches = composite.render([posed], rays, STOP)
+            row[f"psnr_db_{factor}"] = _psnr(_picture(marches, [posed], rays) - exact)
             row[f"cpu_seconds_{factor}"] = _seconds(
                 lambda p=posed, r=rays: march(p, r, STOP), repeats
             )
@@ -109,10 +109,10 @@ def _composites(width: int, height: int) -> Iterator[tuple[str, dict[str, float]
     for foot in HEIGHTS:
         z = foot - SCALE * float(item.lower[2])
         fields = [scene, PosedField(item, Pose.upright((*PLACE, z), 0.0, SCALE))]
-        seen = [way.render(fields, rays, STOP) for way in ways]
-        folded, exact = (_picture(some, fields, rays) for some in seen)
+        marches = [way.render(fields, rays, STOP) for way in ways]
+        folded, exact = (_picture(some, fields, rays) for some in marches)
         error = 255 * np.abs(folded - exact)
-        error = error[seen[0].layers[1].opacity.numpy() > PRESENT]
+        error = error[marches[0].layers[1].opacity.numpy() > PRESENT]
         yield (
             f"{foot:g}",
             {
@@ -140,9 +140,9 @@ def _levels(width: int, height: int) -> Iterator[tuple[str, dict[str, float]]]:
             pictures, opacities = [], []
             for way in ways:
                 with way():
-                    seen = DepthComposite().render([posed], rays, STOP)
-                    pictures.append(_picture(seen, [posed], rays))
-                    opacities.append(seen.total.opacity.numpy())
+                    marches = DepthComposite().render([posed], rays, STOP)
+                    pictures.append(_picture(marches, [posed], rays))
+                    opacities.append(marches.total.opacity.numpy())
             errors.append(pictures[1] - pictures[0])
             own.append(opacities[0] > PRESENT)
         error, present = np.concatenate(errors), np.concatenate(own)
@@ -163,10 +163,10 @@ def _rays(width: int, height: int, angle: float, pose: np.ndarray) -> Rays:
     return rays
 
 
-def _picture(seen: Seen, fields: list[PosedField], rays: Rays) -> np.ndarray:
+def _picture(marches: Marches, fields: list[PosedField], rays: Rays) -> np.ndarray:
     """Return sRGB (n, 3) over the background of the first field."""
     behind = fields[0].background(rays.direction)
-    linear = seen.total.radiance + (1 - seen.total.opacity) * behind
+    linear = marches.total.radiance + (1 - marches.total.opacity) * behind
     return linear_to_srgb_numpy(linear.numpy().T)
 
 

@@ -54,15 +54,18 @@ class BenchPoses:
         variant.ensure()
         work = self.output
         if not (work / "given" / TRANSFORMS).is_file():
-            write_given(read_images(self.folder, skip_missing=True), work)
+            write_photographs(read_images(self.folder, skip_missing=True), work)
         if not (work / "posed" / TRANSFORMS).is_file():
             words = [str(work / "photographs"), "-o", str(work / "posed")]
             edge = ["--long-edge", str(self.long_edge)]
             run_command(["capture", "photographs", *words, *edge])
-        given = read_images(work / "given", skip_missing=True)
-        found = read_images(work / "posed")
-        turns, shares = pose_errors(found.camera_to_world, given.camera_to_world)
-        cameras = [(found.camera_of(i), given.camera_of(i)) for i in range(len(found))]
+        original = read_images(work / "given", skip_missing=True)
+        estimated = read_images(work / "posed")
+        turns, shares = pose_errors(estimated.camera_to_world, original.camera_to_world)
+        cameras = [
+            (estimated.camera_of(i), original.camera_of(i))
+            for i in range(len(estimated))
+        ]
         table = files.read_json(work / "posed" / "capture.json")
         document = {
             "photographs": table["photographs"],
@@ -112,9 +115,9 @@ class BenchGaps:
         variant.ensure()
         check_positive(self, "steps", "long_edge")
         files.make_folder(self.output)
-        found = [thinned(self, every) for every in self.every]
-        told = stamp({"rows": found}, "python -m bench gaps")
-        files.write_json(self.output / FIGURES, told)
+        figures = [thinned(self, every) for every in self.every]
+        document = stamp({"rows": figures}, "python -m bench gaps")
+        files.write_json(self.output / FIGURES, document)
         header = (
             "fitted to",
             "PSNR of these",
@@ -128,44 +131,46 @@ class BenchGaps:
                 f"{row['gap_deg']:.1f} degrees",
                 f"{row['psnr_db']:.1f} dB",
             )
-            for row in found
+            for row in figures
         ]
-        return Result({"rows": found}, lambda: print(markdown(header, rows)))
+        return Result({"rows": figures}, lambda: print(markdown(header, rows)))
 
 
-def write_given(given: PosedImages, work: Path) -> None:
+def write_photographs(original: PosedImages, work: Path) -> None:
     """Write photographs without poses, and a transforms.json with the poses given.
 
     Args:
-        given: the photographs, with their poses.
+        original: the photographs, with their poses.
         work: folder that gets `photographs` and `given`.
     """
     photographs = files.make_folder(work / "photographs")
-    names = [f"{i:04d}.png" for i in range(len(given))]
-    for image, name in zip(given.images, names, strict=True):
+    names = [f"{i:04d}.png" for i in range(len(original))]
+    for image, name in zip(original.images, names, strict=True):
         files.write_image(photographs / name, image[..., :3])
-    cameras = [given.camera_of(i) for i in range(len(given))]
+    cameras = [original.camera_of(i) for i in range(len(original))]
     stored = [f"../posed/images/{name}" for name in names]  # upright, if placed
     files.make_folder(work / "given")
-    write_poses(work / "given" / TRANSFORMS, stored, cameras, given.camera_to_world)
+    write_poses(work / "given" / TRANSFORMS, stored, cameras, original.camera_to_world)
 
 
-def pose_errors(found: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pose_errors(
+    estimated: np.ndarray, original: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Compare poses (n, 4, 4) after a similarity of their places.
 
     Returns:
         rotations that remain, degrees, and distances by the greatest one between two
-        given places, (n,) each.
+        original places, (n,) each.
     """
-    eyes, wanted = found[:, :3, 3], given[:, :3, 3]
-    centred, target = eyes - eyes.mean(0), wanted - wanted.mean(0)
+    eyes, original_eyes = estimated[:, :3, 3], original[:, :3, 3]
+    centred, target = eyes - eyes.mean(0), original_eyes - original_eyes.mean(0)
     turn = Rotation.align_vectors(target, centred)[0]
     turned = turn.apply(centred)
     scale = (turned * target).sum() / (turned**2).sum()
-    left = turn * Rotation.from_matrix(found[:, :3, :3])
-    left = left.inv() * Rotation.from_matrix(given[:, :3, :3])
+    left = turn * Rotation.from_matrix(estimated[:, :3, :3])
+    left = left.inv() * Rotation.from_matrix(original[:, :3, :3])
     apart = np.linalg.norm(scale * turned - target, axis=1)
-    return np.degrees(left.magnitude()), apart / pdist(wanted).max()
+    return np.degrees(left.magnitude()), apart / pdist(original_eyes).max()
 
 
 def thinned(options: BenchGaps, every: int) -> dict[str, Any]:
@@ -175,8 +180,8 @@ def thinned(options: BenchGaps, every: int) -> dict[str, Any]:
         number of photographs that were fitted to; PSNR of these by the loss at the
         end; median gap to these (`view_gaps`, degrees) and mean PSNR of the others, dB.
     """
-    whole = read_images(options.folder, options.long_edge)
-    kept = np.arange(0, len(whole), every)
+    images = read_images(options.folder, options.long_edge)
+    indices = np.arange(0, len(images), every)
     output = options.output / f"every-{every}-{options.steps}.safetensors"
     if not output.is_file():
         own = files.make_folder(options.output / f"every-{every}")
@@ -192,15 +197,15 @@ def thinned(options: BenchGaps, every: int) -> dict[str, Any]:
         words = ["fit", str(own), "-o", str(output), "--network", "small"]
         words += ["--steps", str(options.steps), "--long-edge", str(options.long_edge)]
         run_command(words)
-    fitted = np.zeros(len(whole), bool)
-    fitted[np.delete(kept, held_out(len(kept)))] = True
-    assert whole.points is not None
-    cameras = [whole.camera_of(i) for i in range(len(whole))]
-    gaps = view_gaps(cameras, whole.camera_to_world, whole.points, fitted)
+    fitted = np.zeros(len(images), bool)
+    fitted[np.delete(indices, held_out(len(indices)))] = True
+    assert images.points is not None
+    cameras = [images.camera_of(i) for i in range(len(images))]
+    gaps = view_gaps(cameras, images.camera_to_world, images.points, fitted)
     renderer, scores = FieldRenderer(load_field(output)), []
     for i in np.flatnonzero(~fitted).tolist():
-        shown = renderer.render(cameras[i], whole.camera_to_world[i]).image
-        scores.append(float(compare(shown, reference(whole, i))[0]))
+        shown = renderer.render(cameras[i], images.camera_to_world[i]).image
+        scores.append(float(compare(shown, reference(images, i))[0]))
     report = files.read_json(output.with_suffix(".report") / "metrics.json")
     return {
         "every": every,

@@ -79,10 +79,10 @@ class BenchGpu:
 
     def run(self) -> Result:
         """Look for the GPU, measure, write and print."""
-        found = find_gpu()
-        about = {"gpu": found, "variant": VARIANT}
-        start = results.stamp(about, "make bench-gpu")
-        name = f"{found['name']} gpu"
+        gpu = find_gpu()
+        setup = {"gpu": gpu, "variant": VARIANT}
+        start = results.stamp(setup, "make bench-gpu")
+        name = f"{gpu['name']} gpu"
         document = measure(
             PLAN, start, lambda made: results.write(self.output, name, made)
         )
@@ -90,10 +90,10 @@ class BenchGpu:
         good = all(step.get("exit_code") == 0 for step in steps.values())
 
         def show() -> None:
-            print(found["name"])
+            print(gpu["name"])
             for name, step in steps.items():
-                told = step.get("error", "done")
-                print(f"{name:7} {step['seconds']:4.0f} s  {told}")
+                outcome = step.get("error", "done")
+                print(f"{name:7} {step['seconds']:4.0f} s  {outcome}")
             if "result" in steps["frames"]:
                 print(*frame_lines(steps["frames"]["result"]), sep="\n")
 
@@ -155,10 +155,10 @@ def find_gpu() -> dict[str, Any]:
             f"bench gpu: PyTorch {torch.__version__} finds no GPU, Dr.Jit does; "
             "install the build of PyTorch for the driver's version of CUDA"
         )
-    about = torch.cuda.get_device_properties(0)
+    properties = torch.cuda.get_device_properties(0)
     return {
-        "name": about.name,
-        "memory_mb": about.total_memory / 1e6,
+        "name": properties.name,
+        "memory_mb": properties.total_memory / 1e6,
         "torch_cuda": torch.version.cuda,
     }
 
@@ -185,10 +185,10 @@ def measure(
         for done, step in enumerate(plan):
             show("steps", done, len(plan), step.name)
             start = time.monotonic()
-            found = _outcome(step)
+            outcome = _outcome(step)
             seconds = time.monotonic() - start
             command = " ".join(["python", *step.arguments])
-            steps[step.name] = {"command": command, "seconds": seconds, **found}
+            steps[step.name] = {"command": command, "seconds": seconds, **outcome}
             keep(document)
         show("steps", len(plan), len(plan), "")
     return document
@@ -210,10 +210,10 @@ def _outcome(step: Step) -> dict[str, Any]:
         finally:  # Ctrl-C, too: others would compute on
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
-    found, code = _figures(output), process.returncode
-    if found is None:
+    figures, code = _figures(output), process.returncode
+    if figures is None:
         return {"error": f"ended with {code}, without figures; see above"}
-    return {"exit_code": code, "result": found}
+    return {"exit_code": code, "result": figures}
 
 
 def _figures(output: str) -> dict[str, Any] | None:

@@ -125,16 +125,16 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 def row(world: World, reach: Reach) -> dict[str, Any]:
     """Return the figures of a place."""
-    seen = reach.pixels > 0
+    in_view = reach.pixels > 0
     farthest = np.abs(reach.cross_track_m).max(1)
     width = world.scenario.vehicle.width_m
     middle = {"pixels": 0.0, "moved": 0.0}
-    if seen.any():
-        middle["pixels"] = float(np.median(reach.pixels[seen]))
-        middle["moved"] = float(np.median(reach.moved[seen]))
+    if in_view.any():
+        middle["pixels"] = float(np.median(reach.pixels[in_view]))
+        middle["moved"] = float(np.median(reach.moved[in_view]))
     return {
-        "frames": len(seen),
-        "in_view": int(seen.sum()),
+        "frames": len(in_view),
+        "in_view": int(in_view.sum()),
         "most_pixels": int(reach.pixels.max()),
         "most_moved": float(reach.moved.max()),
         **middle,

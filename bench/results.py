@@ -121,11 +121,11 @@ def machine() -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python, LLVM and the packages that compute."""
-    found = {name: importlib.metadata.version(name) for name in PACKAGES}
+    by_name = {name: importlib.metadata.version(name) for name in PACKAGES}
     number = llvm.version()
-    found["llvm"] = ".".join(map(str, number)) if number else "none"
-    found["python"] = platform.python_version()
-    return found
+    by_name["llvm"] = ".".join(map(str, number)) if number else "none"
+    by_name["python"] = platform.python_version()
+    return by_name
 
 
 def stamp(document: dict[str, Any], command: str) -> dict[str, Any]:

@@ -60,9 +60,9 @@ class BenchRoughness:
                 place = f"{cell.route}, {cell.objects}"
                 if rows.empty or place not in set(rows["place"]):
                     scenario = Scenario.model_validate(parse_toml(PLACES, cell.text))
-                    found = pd.DataFrame(_measure(scenario, self.changes, show))
-                    found.insert(0, "place", place)
-                    rows = pd.concat([rows, found], ignore_index=True)
+                    measured = pd.DataFrame(_measure(scenario, self.changes, show))
+                    measured.insert(0, "place", place)
+                    rows = pd.concat([rows, measured], ignore_index=True)
                     text = rows.to_csv(index=False, float_format="%.6g")
                     files.write_text(self.output, text)
                     gc.collect()

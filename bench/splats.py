@@ -152,7 +152,7 @@ def _on_surfaces(
     areas = np.array([float(np.ravel(s.surface_area())[0]) for s in scene.shapes()])
     wide = areas > FLAT  # of which little is near
     share = np.where(wide, 40, 2 * areas / areas[~wide].sum())
-    found = []
+    surfels = []
     for shape, drawn in zip(scene.shapes(), share * count / 2, strict=True):
         sample = mi.Point2f(rng.random((2, int(drawn) + 1)))
         at = shape.sample_position(mi.Float(0), sample)
@@ -161,8 +161,8 @@ def _on_surfaces(
         colour = si.bsdf().eval_diffuse_reflectance(si)
         part = np.concatenate([np.array(x) for x in (at.p, at.n, colour)]).T
         near = np.abs(part[:, :2]).max(1) < FAR_M
-        found.append(part[np.array(si.is_valid()) & near])
-    rows = rng.permutation(np.concatenate(found))[:count].astype(np.float64)
+        surfels.append(part[np.array(si.is_valid()) & near])
+    rows = rng.permutation(np.concatenate(surfels))[:count].astype(np.float64)
     return rows[:, :3], rows[:, 3:6], rows[:, 6:]
 
 

@@ -17,7 +17,7 @@ from mi_nerfattack.scenario.world import build_attack, build_world
 from mi_nerfattack.scenes import bundled
 
 #: Settings of [attack.vary], by part.
-PARTS = {
+SETTINGS = {
     "nothing": (),
     "sun": ("sun={elevation_deg = [15, 60], share = [0.0, 0.9]}",),
     "light": ("light_ev_sd=0.5", "light_colour_ev_sd=0.1"),
@@ -51,8 +51,8 @@ class BenchVary(Comparison):
 def measure(options: BenchVary, folder: Path, show: Progress) -> dict[str, Any]:
     """Measure everything, and return the document, but for its stamp."""
     del folder
-    turns: dict[str, list[float]] = {part: [] for part in PARTS}
-    attacks = {part: _attack(options, part) for part in PARTS}
+    turns: dict[str, list[float]] = {part: [] for part in SETTINGS}
+    attacks = {part: _attack(options, part) for part in SETTINGS}
     for turn in range(WARM_UP + options.repeats):
         show("vary", turn, WARM_UP + options.repeats, "")
         for part, attack in attacks.items():
@@ -68,7 +68,7 @@ def measure(options: BenchVary, folder: Path, show: Progress) -> dict[str, Any]:
 def _attack(options: BenchVary, part: str) -> AbstractAttack:
     """Return the attack with one part of the variation."""
     settings = [f"attack.poses={options.poses}", *DRIVE]
-    settings += [f"attack.vary.{text}" for text in PARTS[part]]
+    settings += [f"attack.vary.{text}" for text in SETTINGS[part]]
     if options.quick:
         settings += ["drive.length_m=2", "camera.width=40", "camera.height=20"]
     scenario, _ = load_scenario(bundled("demo.toml"), settings=settings)

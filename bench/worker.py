@@ -103,10 +103,10 @@ def memory() -> dict[str, float]:
 
     On a GPU also what PyTorch's tensors took of it at most.
     """
-    found = {"peak_memory_mb": peak_memory_mb()}
+    peaks = {"peak_memory_mb": peak_memory_mb()}
     if torch.get_default_device().type == "cuda":
-        found["gpu_memory_mb"] = torch.cuda.max_memory_allocated() / 1e6
-    return found
+        peaks["gpu_memory_mb"] = torch.cuda.max_memory_allocated() / 1e6
+    return peaks
 
 
 def wait() -> None:
@@ -128,9 +128,9 @@ def _serve(module: str, side: str, arguments: str) -> None:
     one = make(*json.loads(arguments))
     print(json.dumps("ready"), flush=True)
     for line in sys.stdin:
-        question, *given = json.loads(line)
+        question, *inputs = json.loads(line)
         ask = memory if question == "memory" else getattr(one, question)
-        print(json.dumps(ask(*given)), flush=True)
+        print(json.dumps(ask(*inputs)), flush=True)
 
 
 if __name__ == "__main__":

@@ -54,8 +54,8 @@ def blocks(page: Path) -> Iterator[Block]:
             assert token.map is not None
             language = token.info.split()[0] if token.info else ""
             yield Block(token.map[0] + 1, language, token.content, mark, why)
-        found = re.fullmatch(r"<!-- (long|skip): (.*?) -->\s*", token.content, re.S)
-        mark, why = found.groups() if found else ("", "")
+        match = re.fullmatch(r"<!-- (long|skip): (.*?) -->\s*", token.content, re.S)
+        mark, why = match.groups() if match else ("", "")
 
 
 def follow(page: Path, folder: Path, long: bool) -> Iterator[str]:
@@ -110,17 +110,17 @@ def main() -> int:
     parser.add_argument("pages", nargs="+", type=Path)
     parser.add_argument("--long", action="store_true", help="run what takes long, too")
     parser.add_argument("--keep", type=Path, help="work in this folder, and leave it")
-    given = parser.parse_args()
+    options = parser.parse_args()
     failed = False
-    for page in given.pages:
+    for page in options.pages:
         with tempfile.TemporaryDirectory() as scratch:
-            above = given.keep or Path(scratch)
+            above = options.keep or Path(scratch)
             folder = above / page.stem
             folder.mkdir(parents=True)
             if not (above / "scenes").exists():
                 (above / "scenes").symlink_to(ROOT / "scenes")
             try:
-                for line in follow(page, folder, given.long):
+                for line in follow(page, folder, options.long):
                     print(line, flush=True)
             except FailedError as error:
                 print(error, flush=True)

@@ -117,8 +117,8 @@ def plugin_reference() -> str:
                 f"![Picture of {source.stem}](../pictures/plugin_{source.stem}.jpg)"
             )
             contents.append(f"- [{heading}](#{anchor})")
-            parts = [part for node in body for part in block(node)]
-            sections += [f"## {heading}", picture, *parts, LIMITS]
+            paragraphs = [paragraph for node in body for paragraph in block(node)]
+            sections += [f"## {heading}", picture, *paragraphs, LIMITS]
     return "\n".join(contents) + "\n\n" + "\n\n".join(sections) + "\n"
 
 

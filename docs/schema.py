@@ -29,13 +29,13 @@ def schemas() -> dict[Path, str]:
 
 def schema(model: type[Section]) -> dict[str, Any]:
     """Return the schema of a file, without names that repeat its keys."""
-    found = model.model_json_schema()
-    if policy := found["properties"].get("policy"):
+    document = model.model_json_schema()
+    if policy := document["properties"].get("policy"):
         for choice in policy["anyOf"]:  # whose kind the suffix of the file tells
-            kind = found["$defs"][choice["$ref"].rpartition("/")[2]]
+            kind = document["$defs"][choice["$ref"].rpartition("/")[2]]
             kind["required"] = [key for key in kind["required"] if key != "kind"]
     head = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
-    return head | _untitled(found)
+    return head | _untitled(document)
 
 
 def _untitled(value: Any) -> Any:

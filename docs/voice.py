@@ -112,15 +112,15 @@ class Passage:
 def findings(markdown: str, results: bool = False) -> list[Finding]:
     """Find all that breaks the voice in a page; results may name machines."""
     tokens = MarkdownIt().enable("table").parse(markdown)
-    found: list[Finding] = []
+    faults: list[Finding] = []
     for passage in passages(tokens):
-        found += _phrases(passage)
+        faults += _phrases(passage)
         if not passage.in_table:
-            found += _long_sentences(passage)
-    found += _long_lines(markdown, tokens)
+            faults += _long_sentences(passage)
+    faults += _long_lines(markdown, tokens)
     if not results:
-        found += _machines(markdown)
-    return sorted(found)
+        faults += _machines(markdown)
+    return sorted(faults)
 
 
 def passages(tokens: Sequence[Token]) -> Iterator[Passage]:
@@ -267,9 +267,9 @@ def findings_in(name: str, path: Path) -> list[Finding]:
     if path.suffix != ".py":
         return findings(text, results=name.startswith(_RESULTS))
     return [
-        replace(found, line=passage.line + found.line - 1)
+        replace(finding, line=passage.line + finding.line - 1)
         for passage in docstrings(text)
-        for found in findings(passage.text)
+        for finding in findings(passage.text)
     ]
 
 
@@ -279,9 +279,9 @@ def main() -> int:
     parser.add_argument("pages", nargs="*", help="all without one")
     named = {name: Path(name) for name in parser.parse_args().pages}
     lines = [
-        f"{name}:{found.line}: {found.kind}: {found.text}"
+        f"{name}:{finding.line}: {finding.kind}: {finding.text}"
         for name, path in (named or {**pages(), **modules()}).items()
-        for found in findings_in(name, path)
+        for finding in findings_in(name, path)
     ]
     print("\n".join(lines) or "no findings")
     return int(bool(lines))

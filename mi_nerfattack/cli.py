@@ -46,7 +46,7 @@ EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
-_ABOUT = "Find, measure and repair failures of image-based driving policies."
+_DESCRIPTION = "Find, measure and repair failures of image-based driving policies."
 _HINT = (
     "--debug, anywhere, shows the traceback of an error; --version prints the version."
 )
@@ -77,8 +77,8 @@ def main(
     except NerfAttackError as err:
         return _fail(f"error: {err}", EXIT_INPUT, debug)
     except KeyboardInterrupt as err:
-        told = f"interrupted{err if isinstance(err, _Interrupted) else ''}"
-        return _fail(told, EXIT_INTERRUPTED, debug)
+        message = f"interrupted{err if isinstance(err, _Interrupted) else ''}"
+        return _fail(message, EXIT_INTERRUPTED, debug)
     except MemoryError as err:
         advice = "give fewer or smaller images, cells or views"
         return _fail(f"error: not enough memory: {err}; {advice}", EXIT_INPUT, debug)
@@ -124,13 +124,16 @@ def _run(arguments: list[str], themes: Mapping[str, Commands], prog: str) -> int
         return 0
     commands = flat(themes)
     _check_name(arguments, commands)
-    about, level, rest = _ABOUT, prog, arguments
+    description, level, level_arguments = _DESCRIPTION, prog, arguments
     if arguments and isinstance(group := commands.get(arguments[0]), Group):
-        about, level = group.about, f"{prog} {arguments[0]}"
-        themes, rest = {"": group.commands}, arguments[1:]
-    if rest in ([], ["-h"], ["--help"]):
-        print(_overview(themes, about, level), file=sys.stdout if rest else sys.stderr)
-        return 0 if rest else EXIT_INPUT
+        description, level = group.description, f"{prog} {arguments[0]}"
+        themes, level_arguments = {"": group.commands}, arguments[1:]
+    if level_arguments in ([], ["-h"], ["--help"]):
+        print(
+            _overview(themes, description, level),
+            file=sys.stdout if level_arguments else sys.stderr,
+        )
+        return 0 if level_arguments else EXIT_INPUT
     try:
         with _FIELDS:
             kinds = _one_of(commands)
@@ -171,27 +174,29 @@ def _fields(
     info: tyro.constructors.StructTypeInfo,
 ) -> tyro.constructors.StructConstructorSpec | None:
     """Show each option of a command as a paragraph, and no default of None or False."""
-    kind, given = info.type, info.default
+    kind, defaults = info.type, info.default
     if not getattr(kind, "__module__", "").startswith("mi_nerfattack.commands."):
         return None
     types, texts = get_type_hints(kind, include_extras=True), {}
     for level in filter(dataclasses.is_dataclass, reversed(kind.__mro__)):
         for item in docstring_parser.parse_from_object(level).params:
             texts[item.arg_name] = " ".join((item.description or "").split())
-    found = []
+    options = []
     for item in dataclasses.fields(kind):
         default = item.default
         if item.default_factory is not dataclasses.MISSING:
             default = item.default_factory()
         elif default is dataclasses.MISSING:
             default = tyro.MISSING
-        default = getattr(given, item.name, default)
+        default = getattr(defaults, item.name, default)
         alike = _ALIKE.get(item.name, {})
         shown = tyro.conf.arg(help_behavior_hint=_default, **alike)
         typed: Any = Annotated[types[item.name], shown]
         text = texts.get(item.name) or _TEXTS.get(item.name)
-        found.append(tyro.constructors.StructFieldSpec(item.name, typed, default, text))
-    return tyro.constructors.StructConstructorSpec(kind, tuple(found))
+        options.append(
+            tyro.constructors.StructFieldSpec(item.name, typed, default, text)
+        )
+    return tyro.constructors.StructConstructorSpec(kind, tuple(options))
 
 
 def _default(value: str) -> str:
@@ -206,7 +211,7 @@ def _one_of(commands: Commands) -> Any:
             tyro.conf.subcommand(
                 name,
                 constructor=_one_of(item.commands) if isinstance(item, Group) else item,
-                description=item.about if isinstance(item, Group) else None,
+                description=item.description if isinstance(item, Group) else None,
             ),
         ]
         for name, item in commands.items()
@@ -214,13 +219,17 @@ def _one_of(commands: Commands) -> Any:
     return reduce(operator.or_, members)
 
 
-def _overview(themes: Mapping[str, Commands], about: str, prog: str) -> str:
+def _overview(themes: Mapping[str, Commands], description: str, prog: str) -> str:
     """Return the first help, also of a group: a sentence a command, by theme."""
-    lines = [f"usage: {prog} COMMAND ...", "", about]
+    lines = [f"usage: {prog} COMMAND ...", "", description]
     for theme, commands in themes.items():
         lines += ["", *([theme] if len(commands) > 1 and theme else [])]
         for name, item in commands.items():
-            text = item.about if isinstance(item, Group) else inspect.getdoc(item) or ""
+            text = (
+                item.description
+                if isinstance(item, Group)
+                else inspect.getdoc(item) or ""
+            )
             first = text.split("\n\n")[0].replace("\n", " ")
             lines += textwrap.wrap(
                 first, 80, initial_indent=f"  {name:10}", subsequent_indent=" " * 12
@@ -247,10 +256,10 @@ def _check_name(arguments: Sequence[str], commands: Commands, group: str = "") -
     """Raise InputError of a word that is no command, with those that resemble it."""
     if not arguments or arguments[0].startswith("-"):
         return
-    name, *more = arguments
+    name, *group_arguments = arguments
     if name in commands:
         if isinstance(item := commands[name], Group):
-            _check_name(more, item.commands, f"{name} ")
+            _check_name(group_arguments, item.commands, f"{name} ")
         return
     near = difflib.get_close_matches(name, commands)
     near = [f"{group}{one}" for one in near]

@@ -24,8 +24,8 @@ class NerfAttackError(Exception):
             message = message[:_HEAD] + left_out + message[-_TAIL:]
         super().__init__(message)
         self.where: str = message.partition(": ")[0]
-        _, found, last = message.rpartition("; ")
-        self.remedy: str = found and last
+        _, separator, last = message.rpartition("; ")
+        self.remedy: str = separator and last
 
 
 class InputError(NerfAttackError, ValueError):
@@ -47,3 +47,10 @@ def is_interrupt(error: BaseException | None) -> bool:
             return True
         error = error.__cause__ or error.__context__
     return False
+
+
+def is_of_disk(error: BaseException | None) -> bool:
+    """Tell an error that no other scenario mends, such as a full disk."""
+    while error is not None and not isinstance(error, OSError):
+        error = error.__cause__
+    return error is not None

@@ -28,7 +28,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
 SomeShare = Annotated[float, Field(gt=0, le=1)]
 Acute = Annotated[float, Field(gt=0, lt=math.pi / 2, description=", radians")]
-Whole = Annotated[int, Field(ge=0)]
+Natural = Annotated[int, Field(ge=0)]
 Count = Annotated[int, Field(ge=1)]
 Seed = Annotated[int, Field(ge=0, lt=1 << 31)]
 Name = Annotated[str, Field(min_length=1, description="a name, not empty")]
@@ -92,8 +92,8 @@ def checked(owner: str = "") -> Callable[[type[_T]], type[_T]]:
 def _from_table(cls: type, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
     """Let a scenario's table give the fields: each strict, the object made of them."""
     schema = handler(source)
-    found: Any = handler.resolve_ref_schema(schema)
-    found["strict"] = False
+    resolved_schema: Any = handler.resolve_ref_schema(schema)
+    resolved_schema["strict"] = False
     return schema
 
 

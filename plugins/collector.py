@@ -10,7 +10,7 @@ import drjit as dr
 
 from mi_nerfattack.backend.freeze import freeze_method
 from mi_nerfattack.render.backdrop import AbstractBackdrop, Layer
-from mi_nerfattack.render.composite import AbstractComposite, Seen
+from mi_nerfattack.render.composite import AbstractComposite, Marches
 from mi_nerfattack.render.march import RayGradient
 from mi_nerfattack.render.rays import March, Rays, Task, TaskQueue
 from mi_nerfattack.render.scene_march import AbstractSceneMarch
@@ -32,41 +32,45 @@ class RayCollector:
         self, composite: AbstractComposite, posed: Sequence[Layer], stop: float
     ) -> None:
         self.waits = False
-        self._parts = composite, list(posed), stop
-        self._wanted: tuple[int, ...] = ()
+        self._arguments = composite, list(posed), stop
+        self._layers: tuple[int, ...] = ()
         self._frozen = freeze_method(self._accumulate, self._state)
         self._queue = TaskQueue()
         self._by_rays = freeze_method(self._march_back, self._rays_state)
 
-    def add(self, rays: Rays, seen: Seen, cotangent: Seen) -> None:
+    def add(self, rays: Rays, primal: Marches, cotangent: Marches) -> None:
         """Take rays; see :meth:`AbstractComposite.backward`."""
-        composite, posed, _ = self._parts
-        for task in composite.tasks(posed, rays, seen, cotangent):
+        composite, posed, _ = self._arguments
+        for task in composite.tasks(posed, rays, primal, cotangent):
             for ready in self._queue.add(task):
                 self._launch(ready)
         if not self.waits:
             self.finish()
 
     def by_rays(
-        self, rays: Rays, seen: Seen, cotangent: Seen, wanted: Sequence[int]
+        self, rays: Rays, primal: Marches, cotangent: Marches, layers: Sequence[int]
     ) -> list[RayGradient]:
         """See :meth:`AbstractComposite.backward_rays`; marches at once."""
-        self._wanted = tuple(wanted)
+        self._layers = tuple(layers)
         # A render, which somebody may be recording, or what cannot be recorded
-        if not self.waits or self._has_backdrop(wanted):
-            return self._march_back(rays, seen, cotangent)
-        dr.make_opaque(rays, seen, cotangent)
-        return self._by_rays(rays, seen, cotangent)
+        if not self.waits or self._has_backdrop(layers):
+            return self._march_back(rays, primal, cotangent)
+        dr.make_opaque(rays, primal, cotangent)
+        return self._by_rays(rays, primal, cotangent)
 
-    def _march_back(self, rays: Rays, seen: Seen, cotangent: Seen) -> list[RayGradient]:
-        composite, posed, stop = self._parts
-        return composite.backward_rays(posed, rays, seen, cotangent, stop, self._wanted)
+    def _march_back(
+        self, rays: Rays, primal: Marches, cotangent: Marches
+    ) -> list[RayGradient]:
+        composite, posed, stop = self._arguments
+        return composite.backward_rays(
+            posed, rays, primal, cotangent, stop, self._layers
+        )
 
-    def _rays_state(self, rays: Rays, *more: Any) -> list[Any]:
+    def _rays_state(self, rays: Rays, *arguments: Any) -> list[Any]:
         """Return what the frozen :meth:`_march_back` reads beside its arguments."""
-        composite, posed, stop = self._parts
-        del more
-        sizes = dr.width(rays.direction), self._wanted
+        composite, posed, stop = self._arguments
+        del arguments
+        sizes = dr.width(rays.direction), self._layers
         return [composite, stop, sizes, [item.state() for item in posed]]
 
     def clear(self) -> None:
@@ -83,15 +87,15 @@ class RayCollector:
         (self._accumulate if once else self._frozen)(task)
 
     def _has_backdrop(self, layers: Sequence[int]) -> bool:
-        return any(isinstance(self._parts[1][k], AbstractBackdrop) for k in layers)
+        return any(isinstance(self._arguments[1][k], AbstractBackdrop) for k in layers)
 
     def _accumulate(self, task: Task) -> None:
-        composite, posed, stop = self._parts
+        composite, posed, stop = self._arguments
         composite.accumulate([posed[k] for k in task.fields], task, stop)
 
     def _state(self, task: Task) -> list[Any]:
         """Return what the frozen :meth:`_accumulate` reads beside its argument."""
-        composite, posed, stop = self._parts
+        composite, posed, stop = self._arguments
         return [composite, stop, task.fields, [posed[k].state() for k in task.fields]]
 
 
@@ -107,28 +111,28 @@ class FrozenComposite:
     def __init__(
         self, composite: AbstractComposite, posed: Sequence[Layer], stop: float
     ) -> None:
-        self._parts = composite, list(posed), stop
+        self._arguments = composite, list(posed), stop
         self._first: AbstractSceneMarch | None = None
         self._render = freeze_method(self._record, self._state)
 
-    def render(self, rays: Rays) -> Seen:
+    def render(self, rays: Rays) -> Marches:
         """See :meth:`AbstractComposite.render`; evaluates, so not while recording.
 
         Args:
             rays: n rays, without literals.
         """
-        _, posed, stop = self._parts
-        kept: list[March | None] = []
+        _, posed, stop = self._arguments
+        layers: list[March | None] = []
         for k, layer in enumerate(posed):
             if isinstance(layer, AbstractBackdrop):  # cannot be recorded
-                kept.append(layer.march(rays, stop))
+                layers.append(layer.march(rays, stop))
             else:
-                kept.append(self._scene(rays) if k == 0 else None)
-        return self._render(rays, kept)
+                layers.append(self._scene(rays) if k == 0 else None)
+        return self._render(rays, layers)
 
     def _scene(self, rays: Rays) -> March | None:
         """March the first layer, mostly the scene, in the fastest way, if there is."""
-        composite, posed, stop = self._parts
+        composite, posed, stop = self._arguments
         if posed[0].has_gradients:
             return None
         if self._first is None:
@@ -137,14 +141,14 @@ class FrozenComposite:
             return None
         return self._first.march(replace(rays, gains=rays.gains[:1]))
 
-    def _record(self, rays: Rays, kept: list[March | None]) -> Seen:
-        composite, posed, stop = self._parts
-        if not any(kept):
+    def _record(self, rays: Rays, layers: list[March | None]) -> Marches:
+        composite, posed, stop = self._arguments
+        if not any(layers):
             return composite.render(posed, rays, stop)
-        return composite.restore(posed, rays, kept, stop)
+        return composite.restore(posed, rays, layers, stop)
 
-    def _state(self, rays: Rays, kept: list[March | None]) -> list[Any]:
+    def _state(self, rays: Rays, layers: list[March | None]) -> list[Any]:
         """Return what the frozen :meth:`_record` reads beside its arguments."""
-        composite, posed, stop = self._parts
-        sizes = dr.width(rays.direction), [layer is None for layer in kept]
+        composite, posed, stop = self._arguments
+        sizes = dr.width(rays.direction), [layer is None for layer in layers]
         return [composite, stop, sizes, [item.state() for item in posed]]

@@ -32,7 +32,7 @@ from mi_nerfattack.plugins.properties import (
 )
 from mi_nerfattack.plugins.splat_background import SplatBackgroundVolume
 from mi_nerfattack.render.backdrop import only_fields
-from mi_nerfattack.render.composite import Seen
+from mi_nerfattack.render.composite import Marches
 from mi_nerfattack.render.lighting import spectrum
 from mi_nerfattack.render.lighting.relight import LIGHT_SAMPLES, Relighting
 from mi_nerfattack.render.rays import Gain, Rays
@@ -196,10 +196,10 @@ class FieldIntegrator(FilmIntegrator):
 
     def splats(self, state: State) -> tuple[mi.Float, list[mi.Float]]:
         """See :meth:`FilmIntegrator.splats`."""
-        alpha = state.seen.total.opacity
+        alpha = state.marches.total.opacity
         if state.valid is not None:
             alpha = dr.select(state.valid, 1, alpha)
-        return alpha, [*self.channels.of_film(state.seen), *state.aovs]
+        return alpha, [*self.channels.of_film(state.marches), *state.aovs]
 
     def developed(self, image: mi.TensorXf) -> mi.TensorXf:
         """See :meth:`FilmIntegrator.developed`."""
@@ -266,12 +266,12 @@ class FieldIntegrator(FilmIntegrator):
             state_in = look(self, scene, inner, ray, rays, frozen)
         state: State = state_in
         rays.gains = state.gains
-        valid = state.seen.total.opacity > 0
+        valid = state.marches.total.opacity > 0
         if state.valid is not None:
             valid |= state.valid
         if is_primal:  # L = I + (1 - a) L_b
-            radiance = lay_over(self, state.seen.total, rays, state.behind, ray)
-            aovs = [*self.channels.of_sample(state.seen), *state.aovs]
+            radiance = lay_over(self, state.marches.total, rays, state.behind, ray)
+            aovs = [*self.channels.of_sample(state.marches), *state.aovs]
             return radiance, valid, aovs, state
         if mode == dr.ADMode.Backward:  # from dJ/dL to the parameters, and to the ray
             self._backward(scene, sampler, attached, rays, state, δL, δsplats, δaovs)
@@ -300,19 +300,19 @@ class FieldIntegrator(FilmIntegrator):
         with dr.resume_grad():
             leaf = state.copy()
             direction = mi.Vector3f(rays.direction)
-            dr.enable_grad(leaf.seen, leaf.behind, direction)
+            dr.enable_grad(leaf.marches, leaf.behind, direction)
             lit = replace(rays, direction=direction)
-            radiance = lay_over(self, leaf.seen.total, lit, leaf.behind, ray)
+            radiance = lay_over(self, leaf.marches.total, lit, leaf.behind, ray)
             pairs = []
             if δsplats is not None:
                 alpha, others = self.splats(leaf)
                 pairs = [(alpha, δsplats[0]), *zip(others, δsplats[1], strict=True)]
             if δaovs:
-                pairs += zip(self.channels.of_sample(leaf.seen), δaovs, strict=False)
+                pairs += zip(self.channels.of_sample(leaf.marches), δaovs, strict=False)
             dr.backward_from(sum((x * δ for x, δ in pairs), dr.sum(radiance * δL)))
-            cotangent = dr.grad(leaf.seen)
+            cotangent = dr.grad(leaf.marches)
             if not pairs:  # the colour depends on the total alone
-                cotangent = Seen(cotangent.total)
+                cotangent = Marches(cotangent.total)
             δbehind = None if leaf.behind is None else dr.grad(leaf.behind)
             by_sky = dr.grad(direction) if by_camera else None
         # From dJ/dL_b to BSDFs, bitmaps and lights
@@ -329,27 +329,27 @@ class FieldIntegrator(FilmIntegrator):
             )
         # From dJ/dI and dJ/da to densities and colours: a march again, perhaps later
         if not by_camera and not any(item.has_pose_gradients for item in self.posed):
-            self.collector.add(rays, state.seen, cotangent)
+            self.collector.add(rays, state.marches, cotangent)
             return
         self._backward_rays(ray, rays, state, cotangent, by_sky)
 
     def _backward_rays(
-        self, ray: mi.Ray3f, rays: Rays, state: State, cotangent: Seen, by_sky: Any
+        self, ray: mi.Ray3f, rays: Rays, state: State, cotangent: Marches, by_sky: Any
     ) -> None:
         """March fields, poses and, with `by_sky`, the camera back at once."""
-        wanted = [
+        layers = [
             k
             for k, item in enumerate(self.posed)
             if by_sky is not None or item.has_gradients or item.has_pose_gradients
         ]
-        found = self.collector.by_rays(rays, state.seen, cotangent, wanted)
+        gradients = self.collector.by_rays(rays, state.marches, cotangent, layers)
         # A field that moves is seen as by rays that move against it
-        for k, by_rays in zip(wanted, found, strict=True):
+        for k, by_rays in zip(layers, gradients, strict=True):
             self.posed[k].backward_pose(rays, by_rays)
         # The camera moves all rays alike, and with them what they see of the sky
         if by_sky is not None:
-            by_origin = sum((part.origin for part in found), mi.Vector3f(0))
-            by_direction = sum((part.direction for part in found), by_sky)
+            by_origin = sum((part.origin for part in gradients), mi.Vector3f(0))
+            by_direction = sum((part.direction for part in gradients), by_sky)
             with dr.resume_grad():
                 dr.backward_from(dr.dot(ray.o, by_origin) + dr.dot(ray.d, by_direction))
 
@@ -382,14 +382,14 @@ class FieldIntegrator(FilmIntegrator):
 
     def keep(self, state: State) -> State:
         """Return a state of which only that is left which is costly."""
-        seen: Any = self.composite.keep(state.seen)
-        return replace(state, seen=seen, gains=state.gains if self.relighting else [])
+        gains = state.gains if self.relighting else []
+        return replace(state, marches=self.composite.keep(state.marches), gains=gains)
 
-    def restore(self, ray: mi.Ray3f, kept: State, gains: Sequence[Gain]) -> State:
+    def restore(self, ray: mi.Ray3f, record: State, gains: Sequence[Gain]) -> State:
         """Return the state of rays that :meth:`keep` was given."""
-        rays = Rays(ray.o, ray.d, gains=kept.gains or list(gains))
-        seen = self.composite.restore(self.posed, rays, kept.seen, self.stop)
-        return replace(kept, seen=seen, gains=rays.gains)
+        rays = Rays(ray.o, ray.d, gains=record.gains or list(gains))
+        marches = self.composite.restore(self.posed, rays, record.marches, self.stop)
+        return replace(record, marches=marches, gains=rays.gains)
 
     def to_string(self) -> str:
         """Describe the checked parameters."""

@@ -62,8 +62,8 @@ def place_unit_cube(
 
 def read_limit(props: mi.Properties) -> float:
     """Read `density_limit`, 1/metre."""
-    given: Any = props.get("density_limit", dr.inf)
-    limit = float(given)
+    density_limit: Any = props.get("density_limit", dr.inf)
+    limit = float(density_limit)
     if not limit > 0:
         raise InputError(f"density_limit: {limit}; must be positive, 1/metre")
     return limit
@@ -71,8 +71,8 @@ def read_limit(props: mi.Properties) -> float:
 
 def read_step(props: mi.Properties, own: float) -> float:
     """Read `step_m`, metres in the field's frame."""
-    given: Any = props.get("step_m", own)
-    step = float(given)
+    step_m: Any = props.get("step_m", own)
+    step = float(step_m)
     check_positive("step_m", step)
     return step
 

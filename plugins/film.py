@@ -150,7 +150,7 @@ class _View:
         state_in: Any = None,
     ) -> tuple[Any, Any]:
         """Sample all rays: colour and state, or tangents of colour and splats."""
-        found = self.integrator.sample(
+        samples = self.integrator.sample(
             mode=mode,
             scene=self.scene,
             sampler=sampler,
@@ -162,7 +162,7 @@ class _View:
             state_in=state_in,
             active=mi.Bool(True),
         )
-        return found[0], found[3]
+        return samples[0], samples[3]
 
     def develop(self, colour: Any, alpha: mi.Float, aovs: list) -> mi.TensorXf:
         """Splat rays and divide by their weights; differentiable."""

@@ -91,8 +91,8 @@ def _check_relit(integrator: Any, key: str, node: Any) -> None:
 
 def attached(scene: mi.Scene) -> list[Any]:
     """Return the parameters of a scene that have gradients enabled."""
-    found = [_value(*item[:3]) for item in mi.traverse(scene).properties.values()]
-    return [value for value in found if dr.grad_enabled(value)]
+    values = [_value(*item[:3]) for item in mi.traverse(scene).properties.values()]
+    return [value for value in values if dr.grad_enabled(value)]
 
 
 def _value(value: Any, kind: Any, node: Any) -> Any:

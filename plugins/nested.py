@@ -11,7 +11,7 @@ import mitsuba as mi
 from mi_nerfattack.backend.arrays import differentiates_rays
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.plugins.properties import background
-from mi_nerfattack.render.composite import Seen
+from mi_nerfattack.render.composite import Marches
 from mi_nerfattack.render.lighting import spectrum
 from mi_nerfattack.render.rays import Gain, March, Rays
 
@@ -21,7 +21,7 @@ class State:
     """What the primal pass of a ray hands to its derivatives.
 
     Attributes:
-        seen: what the ray sees of the fields.
+        marches: of the fields, along the ray.
         gains: light on the fields, as of `Rays`.
         behind: (channels, n), what the nested integrator sees; None without a nested
             integrator.
@@ -30,7 +30,7 @@ class State:
         inner: state of the nested integrator.
     """
 
-    seen: Seen
+    marches: Marches
     gains: list[Gain] = field(default_factory=list)
     behind: Any = None
     valid: Any = None
@@ -40,7 +40,7 @@ class State:
     def copy(self) -> State:
         """Return the same with no derivatives attached to what is seen."""
         behind = None if self.behind is None else dr.detach(self.behind)
-        return replace(self, seen=self.seen.copy(), behind=behind)
+        return replace(self, marches=self.marches.copy(), behind=behind)
 
 
 def sample_nested(
@@ -90,24 +90,24 @@ def look(
     """
     light = integrator.relighting
     if light is not None:
-        found = light.gains(scene, sampler, integrator.posed, rays)
-        more = rays.gains or [Gain()] * len(found)
-        pairs = zip(found, more, strict=True)
+        light_gains = light.gains(scene, sampler, integrator.posed, rays)
+        ray_gains = rays.gains or [Gain()] * len(light_gains)
+        pairs = zip(light_gains, ray_gains, strict=True)
         rays.gains = [Gain(colour * gain.colour, gain.row) for colour, gain in pairs]
     if frozen:
         dr.make_opaque(rays)
-        seen = integrator.frozen.render(rays)
+        marches = integrator.frozen.render(rays)
     else:
-        seen = integrator.composite.render(integrator.posed, rays, integrator.stop)
+        marches = integrator.composite.render(integrator.posed, rays, integrator.stop)
     if integrator.behind is None:
-        return State(seen, rays.gains)
+        return State(marches, rays.gains)
     behind, valid, aovs, *inner = sample_nested(
         integrator.behind, dr.ADMode.Primal, scene, sampler, ray, rays.active
     )
     if light is not None:
         shadow = light.behind(scene, sampler, integrator.posed, ray, rays.active)
         behind *= spectrum.reflectance(shadow, ray.wavelengths)
-    return State(seen, rays.gains, behind, valid, list(aovs), *inner)
+    return State(marches, rays.gains, behind, valid, list(aovs), *inner)
 
 
 class Sampled(dr.CustomOp):
@@ -120,8 +120,8 @@ class Sampled(dr.CustomOp):
         del parameters
         self.integrator, self.call = integrator, call
         with dr.suspend_grad():
-            *found, self.state = integrator.sample(dr.ADMode.Primal, **call)
-        return found[0], found[1], found[2]
+            *outputs, self.state = integrator.sample(dr.ADMode.Primal, **call)
+        return outputs[0], outputs[1], outputs[2]
 
     def backward(self) -> None:
         """Accumulate the gradients of the parameters."""
@@ -129,8 +129,8 @@ class Sampled(dr.CustomOp):
         dr.make_opaque(δL)  # `prb` refuses a literal 0
         mode, scene = dr.ADMode.Backward, self.call["scene"]
         with self.integrator.differentiating(scene, mode), dr.suspend_grad():
-            kept = {"δL": δL, "δaovs": δaovs, "state_in": self.state}
-            self.integrator.sample(mode, **self.call, **kept)
+            arguments = {"δL": δL, "δaovs": δaovs, "state_in": self.state}
+            self.integrator.sample(mode, **self.call, **arguments)
 
     def forward(self) -> None:
         """Raise InputError."""
@@ -164,8 +164,10 @@ def push_forward(
     Raises:
         InputError: channels of single fields, which have no tangents in this composite.
     """
-    fixed = integrator.posed, rays, state.seen, integrator.stop
-    tangent = integrator.composite.forward(*fixed)
+    composite = integrator.composite
+    tangent = composite.forward(
+        integrator.posed, rays, primal=state.marches, stop=integrator.stop
+    )
     if len(tangent.layers) < len(integrator.channels.ids):
         raise InputError(
             "composite interleaved: the shares of single fields have no tangents; "
@@ -179,16 +181,16 @@ def push_forward(
         )
     with dr.resume_grad():
         leaf = state.copy()
-        dr.enable_grad(leaf.seen, leaf.behind)
-        dr.set_grad(leaf.seen.total, tangent.total)
-        for layer, part in zip(leaf.seen.layers, tangent.layers, strict=False):
+        dr.enable_grad(leaf.marches, leaf.behind)
+        dr.set_grad(leaf.marches.total, tangent.total)
+        for layer, part in zip(leaf.marches.layers, tangent.layers, strict=False):
             dr.set_grad(layer, part)
         if t_behind is not None:
             dr.set_grad(leaf.behind, t_behind)
-        colour = lay_over(integrator, leaf.seen.total, rays, leaf.behind, ray)
-        found = colour, *integrator.splats(leaf)
+        colour = lay_over(integrator, leaf.marches.total, rays, leaf.behind, ray)
+        outputs = colour, *integrator.splats(leaf)
         flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
-        colour, alpha, aovs = dr.forward_to(found, flags=flags)
+        colour, alpha, aovs = dr.forward_to(outputs, flags=flags)
     return colour, (alpha, aovs)
 
 
@@ -212,15 +214,15 @@ class FieldChannels:
         moments = {depth: moment for depth, _, moment in self._depths()}
         return [moments.get(name, name) for name in self.names()]
 
-    def of_film(self, seen: Seen) -> list[mi.Float]:
+    def of_film(self, marches: Marches) -> list[mi.Float]:
         """Return the film's channels of rays, (n,) each."""
-        return self._list(seen, [m.moment for m in (seen.total, *seen.layers)])
+        return self._list(marches, [m.moment for m in (marches.total, *marches.layers)])
 
-    def of_sample(self, seen: Seen) -> list[mi.Float]:
+    def of_sample(self, marches: Marches) -> list[mi.Float]:
         """Return the image's channels of rays, (n,) each; depth 0 of nothing."""
-        marches = seen.total, *seen.layers
-        depths = [dr.select(m.opacity > 0, m.depth, 0) for m in marches]
-        return self._list(seen, depths)
+        members = marches.total, *marches.layers
+        depths = [dr.select(m.opacity > 0, m.depth, 0) for m in members]
+        return self._list(marches, depths)
 
     def develop(self, image: mi.TensorXf, after: int) -> mi.TensorXf:
         """Divide moments by opacities; infinite where there is nothing.
@@ -236,11 +238,11 @@ class FieldChannels:
         channel = index % count
         values = mi.Float(image.array)
         for depth, opacity, _ in self._depths():
-            here = channel == first + names.index(depth)
+            is_depth = channel == first + names.index(depth)
             back = names.index(depth) - names.index(opacity)
-            weight = dr.gather(mi.Float, image.array, index - mi.Int32(back), here)
+            weight = dr.gather(mi.Float, image.array, index - mi.Int32(back), is_depth)
             mean = values / dr.select(weight > 0, weight, 1)
-            values = dr.select(here, dr.select(weight > 0, mean, dr.inf), values)
+            values = dr.select(is_depth, dr.select(weight > 0, mean, dr.inf), values)
         return mi.TensorXf(values, image.shape)
 
     def _depths(self) -> list[tuple[str, str, str]]:
@@ -248,10 +250,10 @@ class FieldChannels:
         layers = [(f"{name}.Z", f"{name}.A", f"{name}.moment") for name in self.ids]
         return [("depth", "opacity", "moment"), *layers] if self.ids else []
 
-    def _list(self, seen: Seen, depths: list[mi.Float]) -> list[mi.Float]:
+    def _list(self, marches: Marches, depths: list[mi.Float]) -> list[mi.Float]:
         if not self.ids:
             return []
-        found = [seen.total.opacity, depths[0]]
-        for layer, depth in zip(seen.layers, depths[1:], strict=True):
-            found += [*layer.radiance, layer.opacity, depth]
-        return found
+        channels = [marches.total.opacity, depths[0]]
+        for layer, depth in zip(marches.layers, depths[1:], strict=True):
+            channels += [*layer.radiance, layer.opacity, depth]
+        return channels

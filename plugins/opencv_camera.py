@@ -278,17 +278,17 @@ class OpencvCamera(mi.Sensor):
             position, density = self._project(-local.x / z, -local.y / z)
             # On the plane z = 1, solid angle is area times the cosine's cube.
             density *= (distance / z) ** 3
-        seen = mi.Bool(active) & (along >= self.near_clip)
-        seen &= (along <= self.far_clip) & (density > 0)
-        seen &= dr.all((position >= 0) & (position <= self._crop_size))
+        visible = mi.Bool(active) & (along >= self.near_clip)
+        visible &= (along <= self.far_clip) & (density > 0)
+        visible &= dr.all((position >= 0) & (position <= self._crop_size))
         ds = dr.zeros(mi.DirectionSample3f, dr.width(local))
         ds.uv = position
         ds.p = self.m_to_world.translation()
         ds.n = self.m_to_world @ mi.Normal3f(0, 0, 1)
         ds.d = (ds.p - it.p) / distance
         ds.dist = distance
-        ds.pdf = dr.select(seen, mi.Float(1), 0)
-        return ds, mi.Spectrum(dr.select(seen, density / distance**2, 0))
+        ds.pdf = dr.select(visible, mi.Float(1), 0)
+        return ds, mi.Spectrum(dr.select(visible, density / distance**2, 0))
 
     def bbox(self) -> mi.ScalarBoundingBox3f:
         """Return the box that holds nothing but the pinhole."""

@@ -38,8 +38,8 @@ def read_pose(props: mi.Properties) -> Pose:
 
 def read_stop(props: mi.Properties) -> float:
     """Read `stop`, a transmittance."""
-    given: Any = props.get("stop", STOP)
-    stop = float(given)
+    transmittance: Any = props.get("stop", STOP)
+    stop = float(transmittance)
     if not 0 <= stop < 1:
         raise InputError(f"stop: {stop}; allowed is 0 <= stop < 1")
     return stop

@@ -79,12 +79,12 @@ def problems(root: Path = ROOT) -> list[str]:
 
 def over_budget(sizes: dict[str, int]) -> list[str]:
     """Return one line for each part of `BUDGET_MB` that files of these bytes exceed."""
-    parts = dict.fromkeys(BUDGET_MB, 0)
+    totals = dict.fromkeys(BUDGET_MB, 0)
     for name, size in sizes.items():
-        parts[name if name in parts else "other data"] += size
+        totals[name if name in totals else "other data"] += size
     return [
         f"{name}: {size} bytes; the budget is {BUDGET_MB[name]} million"
-        for name, size in parts.items()
+        for name, size in totals.items()
         if size > 1e6 * BUDGET_MB[name]
     ]
 
@@ -130,10 +130,10 @@ def main(arguments: list[str] | None = None) -> int:
     recorder.add_argument("--command", required=True)
     recorder.add_argument("--seed", type=int)
     recorder.add_argument("--note", default="")
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     try:
-        if given.action == "record":
-            record(given.files, given.command, given.seed, given.note)
+        if options.action == "record":
+            record(options.files, options.command, options.seed, options.note)
             return 0
         lines = problems()
     except NerfAttackError as error:

@@ -71,15 +71,15 @@ def loft(
     return mesh, np.concatenate([paint, lids])
 
 
-def merged(parts: Sequence[Part]) -> trimesh.Trimesh:
+def merged(meshes: Sequence[Part]) -> trimesh.Trimesh:
     """Return all parts as one mesh with colours per vertex, metres, z up.
 
     Every face has vertices of its own, therefore it is shaded flat.
     """
-    corners = np.concatenate([np.asarray(mesh.triangles) for mesh, _ in parts])
+    corners = np.concatenate([np.asarray(mesh.triangles) for mesh, _ in meshes])
     colours = [
         np.broadcast_to(np.array(colour, np.uint8), (len(mesh.faces), 4))
-        for mesh, colour in parts
+        for mesh, colour in meshes
     ]
     vertices = corners.reshape(-1, 3)
     return trimesh.Trimesh(

@@ -257,13 +257,13 @@ def test_a_library_that_never_comes_back_ends_with_the_process(number):
 def test_doctor_as_json_and_as_table(run):
     code, out, _ = run("doctor", "--json")
     report = json.loads(out)
-    found = {item["name"]: item for item in report["findings"]}
+    findings = {item["name"]: item for item in report["findings"]}
     assert code == (0 if report["can_run"] else 1)
     names = {"python", "LLVM", "variants", "GPU", "cores", "memory", "disk"}
-    assert names <= set(found)
-    assert "llvm_ad_rgb" in found["variants"]["value"]
-    assert found["default variant"]["state"] == "ok"
-    for item in found.values():
+    assert names <= set(findings)
+    assert "llvm_ad_rgb" in findings["variants"]["value"]
+    assert findings["default variant"]["state"] == "ok"
+    for item in findings.values():
         assert item["state"] == "ok" or item["remedy"], item
     again, table, _ = run("doctor")
     assert again == code and re.search(r"LLVM +\d+\.\d+", table)
@@ -281,17 +281,17 @@ def test_doctor_without_llvm_tells_what_to_do():
     command = [*COMMAND, "doctor", "--json"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 1
-    found = {item["name"]: item for item in json.loads(done.stdout)["findings"]}
-    assert found["LLVM"]["state"] == "missing"
-    assert llvm.PACKAGE in found["LLVM"]["remedy"]
-    assert found["default variant"]["state"] == "missing"
+    findings = {item["name"]: item for item in json.loads(done.stdout)["findings"]}
+    assert findings["LLVM"]["state"] == "missing"
+    assert llvm.PACKAGE in findings["LLVM"]["remedy"]
+    assert findings["default variant"]["state"] == "missing"
 
 
 def test_doctor_reports_what_is_missing():
     needed = doctor.Requirement("no-such-distribution>=2")
-    found = doctor._package(needed, "missing", "install it")
-    assert (found.name, found.state) == ("no-such-distribution", "missing")
-    assert found.remedy == "install it" and not doctor.can_run([found])
+    finding = doctor._package(needed, "missing", "install it")
+    assert (finding.name, finding.state) == ("no-such-distribution", "missing")
+    assert finding.remedy == "install it" and not doctor.can_run([finding])
     old = doctor.Requirement("mitsuba>=99")
     assert ", needed >=99" in doctor._package(old, "absent", "update").value
     assert doctor.can_run([doctor._package(old, "absent", "update")])

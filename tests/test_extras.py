@@ -95,13 +95,13 @@ def roots(tree: ast.AST) -> Iterator[tuple[str, bool]]:
 
 def required(name: str) -> set[str]:
     """Return the packages that a module's own package, or one around it, requires."""
-    found: set[str] = set()
+    packages: set[str] = set()
     while name := name.rpartition(".")[0]:
         if name in SOURCES:
             text = SOURCES[name].read_text("utf-8")
             for words in re.findall(r"(?m)^require\((.*)\)$", text):
-                found |= set(re.findall(r'"(\w+)"', words))
-    return found
+                packages |= set(re.findall(r'"(\w+)"', words))
+    return packages
 
 
 def test_each_import_is_declared_and_optional_ones_are_guarded():
@@ -123,10 +123,10 @@ def arguments(kind: type[Command]) -> list[str]:
     """Return words that start a command, up to the check of its packages."""
     words = WORDS[kind]
     for start in (*STARTS, MONITOR):
-        given = start.format(scenes=ROOT / "scenes").split()
-        if tuple(given[: len(words)]) == words:
+        start_words = start.format(scenes=ROOT / "scenes").split()
+        if tuple(start_words[: len(words)]) == words:
             job = next((j for j in JOBS.values() if j.words == start), None)
-            return [*given, *(job.options.split() if job else ())]
+            return [*start_words, *(job.options.split() if job else ())]
     raise AssertionError(words)
 
 

@@ -79,8 +79,8 @@ def split(listed: str) -> tuple[list[ast.stmt], str]:
 
 def test_each_line_is_new_and_names_a_quick_test():
     assert len(set(LISTED)) == len(LISTED)
-    whole = {line for line in LISTED if "::" not in line}
-    assert not [x for x in LISTED if "::" in x and x.partition("::")[0] in whole]
+    modules = {line for line in LISTED if "::" not in line}
+    assert not [x for x in LISTED if "::" in x and x.partition("::")[0] in modules]
     assert not [listed for listed in LISTED if not quick_tests(*split(listed))]
 
 

@@ -31,10 +31,10 @@ def modules() -> Iterator[tuple[str, Path]]:
     """Yield the name and file of every module of the source tree."""
     for folder in (PACKAGE, "plugins", "scenes", "bench"):
         for path in sorted((ROOT / folder).rglob("*.py")):
-            parts = path.relative_to(ROOT).with_suffix("").parts
+            names = path.relative_to(ROOT).with_suffix("").parts
             if folder in ("plugins", "scenes"):
-                parts = (PACKAGE, *parts)
-            yield ".".join(parts[:-1] if parts[-1] == "__init__" else parts), path
+                names = (PACKAGE, *names)
+            yield ".".join(names[:-1] if names[-1] == "__init__" else names), path
 
 
 SOURCES = dict(modules())

@@ -100,8 +100,8 @@ def test_a_run_shows_verdict_table_and_map(tmp_path):
     assert document["verdict"][0] in shown and "attack" in shown
     assert re.search(r'src="data:image/png;base64,iVBOR[\w+/=]+"', shown)
     frames = tmp_path / "run" / "frames"
-    found = {str(path.relative_to(frames)) for path in nf.Run(tmp_path / "run").frames}
-    assert len(found) == 3 * 4
-    assert {"surrogate_no_object/0000.png", "surrogate_random/0003.png"} <= found
+    names = {str(path.relative_to(frames)) for path in nf.Run(tmp_path / "run").frames}
+    assert len(names) == 3 * 4
+    assert {"surrogate_no_object/0000.png", "surrogate_random/0003.png"} <= names
     picture.unlink()
     assert "<img" not in nf.Run(tmp_path / "run")._repr_html_()

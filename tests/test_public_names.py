@@ -13,7 +13,7 @@ import pytest
 import mi_nerfattack as nf
 
 ROOT = Path(__file__).parents[1]
-PARTS = sorted(
+PACKAGES = sorted(
     path.parent.name
     for path in (ROOT / "mi_nerfattack").glob("*/__init__.py")
     if path.parent.name != "commands"
@@ -61,7 +61,7 @@ print(*sys.modules)
 """
 
 
-@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize("part", PACKAGES)
 def test_all_public_names_resolve(part):
     package = import_module(f"mi_nerfattack.{part}")
     folder = Path(package.__file__ or "").parent
@@ -78,7 +78,7 @@ def test_names_of_the_whole_package_resolve():
     for name in nf.__all__:
         assert getattr(nf, name) is not None
         # a part of that name would hide it as soon as it is loaded
-        assert name not in (*PARTS, "cli", "errors", "notebook", "ranges")
+        assert name not in (*PACKAGES, "cli", "errors", "notebook", "ranges")
     script = {"ClosedLoop", "Rollout", "NoGoal", "bundled", "progress", "Run"}
     assert script | {"attack_policy", "evaluate_policy"} <= set(nf.__all__)
     assert import_module("mi_nerfattack.attack") is nf.attack  # a package

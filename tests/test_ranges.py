@@ -12,7 +12,7 @@ import pytest
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import EvaluateSettings
 from mi_nerfattack.evaluation.field_and_scene import CompareOptions
-from mi_nerfattack.ranges import Acute, Count, Finite, Fraction, Whole, checked
+from mi_nerfattack.ranges import Acute, Count, Finite, Fraction, Natural, checked
 from mi_nerfattack.training.settings import CollectSettings
 from mi_nerfattack.training.train import TrainSettings
 
@@ -24,7 +24,7 @@ class Sizes:
     part: Fraction = 0.5
     angle: Acute = 1.0
     offset: Finite = 0.0
-    frames: Mapping[str, Whole] = field(default_factory=dict)
+    frames: Mapping[str, Natural] = field(default_factory=dict)
     name: str = ""
 
     def __post_init__(self) -> None:
@@ -67,8 +67,8 @@ def test_settings_out_of_range_are_named(make, change):
 
 
 def test_numbers_of_numpy_are_numbers():
-    found = Sizes(count=np.int64(2), part=np.float32(0.25), frames={"a": 0})
-    assert found.count == 2 and found.part == 0.25
+    sizes = Sizes(count=np.int64(2), part=np.float32(0.25), frames={"a": 0})
+    assert sizes.count == 2 and sizes.part == 0.25
 
 
 @pytest.mark.parametrize(

@@ -87,8 +87,9 @@ def _times(
     turns: dict[str, list[dict[str, float]]] = {name: [] for name in TIMES}
     with ExitStack() as stack:
         ours = stack.enter_context(Worker("attack.ours", "OurAttack", *astuple(job)))
-        baked = bricks, *astuple(job)
-        in_bricks = stack.enter_context(Worker("attack.ours", "in_bricks", *baked))
+        in_bricks = stack.enter_context(
+            Worker("attack.ours", "in_bricks", bricks, *astuple(job))
+        )
         sides = [("", ours, WAYS), ("bricks_", in_bricks, WAYS[:2])]
         for _, side, ways in sides:  # traces and compiles
             for way in ways:
@@ -111,26 +112,26 @@ def _times(
         }
     median = {name: medians(some) for name, some in turns.items()}
     row |= {f"{n}_{key}": v for n, some in median.items() for key, v in some.items()}
-    kept, rollout = (row[f"{name}_seconds"] for name in (WAYS[0], "rollout"))
+    iteration, rollout = (row[f"{name}_seconds"] for name in (WAYS[0], "rollout"))
     return row | {
-        "iteration_over_rollout": kept / rollout,
+        "iteration_over_rollout": iteration / rollout,
         "replay_over_rollout": row["replay_seconds"] / rollout,
-        "torch_time_ratio": row["torch_seconds"] / kept,
+        "torch_time_ratio": row["torch_seconds"] / iteration,
         "torch_cpu_ratio": row["torch_cpu_seconds"] / row[f"{WAYS[0]}_cpu_seconds"],
     }
 
 
 def lines(document: dict[str, Any]) -> list[str]:
     """Return the table and the lines below it."""
-    rows, found = [], []
+    rows, notes = [], []
     for size, row in document["sizes"].items():
-        kept = row["kept_backgrounds_seconds"]
+        iteration = row["kept_backgrounds_seconds"]
         for name, whose in TIMES.items():
             values = row[f"{name}_seconds"], row[f"{name}_cpu_seconds"]
-            ratio = row[f"{name}_seconds"] / kept
+            ratio = row[f"{name}_seconds"] / iteration
             rows.append((size, whose, *map(number, (*values, ratio))))
         facts = row["settings"]["ours"]
-        found += [
+        notes += [
             f"{size}: an iteration costs {row['iteration_over_rollout']:.2f} drives "
             f"with kept backgrounds, {row['replay_over_rollout']:.2f} with replay",
             f"{size}: the object fills {facts['object_share_mean']:.1%} of the frame "
@@ -141,4 +142,4 @@ def lines(document: dict[str, Any]) -> list[str]:
             f"{row['kernels_compiled_after_warmup']} kernels",
         ]
     header = ("size", "what", "seconds", "CPU seconds", "to ours")
-    return [markdown(header, rows), "", *found]
+    return [markdown(header, rows), "", *notes]

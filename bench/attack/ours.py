@@ -83,25 +83,25 @@ class OurAttack:
         self.route = path
         self.attacks: dict[str, GradientAttack] = {}
 
-    def iterate(self, how: str) -> dict[str, float]:
+    def iterate(self, way: str) -> dict[str, float]:
         """Drive, differentiate, and update the texture by Adam.
 
         Args:
-            how: a key of `ADJOINTS`.
+            way: a key of `ADJOINTS`.
 
         Returns:
             ``seconds`` and ``cpu_seconds``.
         """
-        if how not in self.attacks:
-            self.attacks[how] = self._attack(how, self.job.horizon)
-        return _timed(self.attacks[how].step)
+        if way not in self.attacks:
+            self.attacks[way] = self._attack(way, self.job.horizon)
+        return _timed(self.attacks[way].step)
 
-    def compile(self, how: str) -> None:
+    def compile(self, way: str) -> None:
         """Let all kernels of :meth:`iterate` be compiled, and kept for later processes.
 
         By an iteration of two periods: their length is compiled into kernels.
         """
-        self._attack(how, 2).step()
+        self._attack(way, 2).step()
 
     def drive(self) -> dict[str, float]:
         """Drive without derivatives, and return what :meth:`iterate` does."""
@@ -112,8 +112,8 @@ class OurAttack:
         shares: list[float] = []
 
         def look(step: Step) -> None:
-            seen = step.observation.kept.seen
-            visible = seen.layers[1].opacity.numpy().reshape(self.job.poses, -1)
+            marches = step.observation.integrator_state.marches
+            visible = marches.layers[1].opacity.numpy().reshape(self.job.poses, -1)
             shares.extend((visible > VISIBLE).mean(1).tolist())
 
         simulate(self.loop, self.initial, self.job.horizon, keep=look)
@@ -123,18 +123,23 @@ class OurAttack:
             "threads": dr.thread_count(),
         }
 
-    def compiled(self, how: str) -> int:
+    def compiled(self, way: str) -> int:
         """Count the kernels that a further iteration compiles."""
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
-            self.iterate(how)
+            self.iterate(way)
             history = dr.kernel_history((dr.KernelType.JIT,))
         return sum(not entry["cache_hit"] for entry in history)
 
-    def _attack(self, how: str, horizon: int) -> GradientAttack:
-        rollout = replace(self.rollout, adjoint=ADJOINTS[how], horizon=horizon)
-        parts = rollout, self.route, self.initial, Freedom(texture_rate=RATE)
-        return GradientAttack(*parts, one_level=how == "one_level")
+    def _attack(self, way: str, horizon: int) -> GradientAttack:
+        rollout = replace(self.rollout, adjoint=ADJOINTS[way], horizon=horizon)
+        return GradientAttack(
+            rollout,
+            self.route,
+            self.initial,
+            freedom=Freedom(texture_rate=RATE),
+            one_level=way == "one_level",
+        )
 
 
 def _timed(action: Callable[[], Any]) -> dict[str, float]:

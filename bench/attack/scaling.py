@@ -83,14 +83,14 @@ class BenchScaling:
         files.check_writable(self.output)
         begun = results.stamp({"rows": []}, results.command_of("scaling", self))
         if self.output.exists():
-            found = files.read_json(self.output)
+            stored = files.read_json(self.output)
             for key in ("command", "machine", "versions"):
-                if found.get(key) != begun[key]:
+                if stored.get(key) != begun[key]:
                     raise InputError(
-                        f"{self.output}: {key} {found.get(key)} there, {begun[key]} "
+                        f"{self.output}: {key} {stored.get(key)} there, {begun[key]} "
                         "here; name another file"
                     )
-            begun["rows"] = found["rows"]
+            begun["rows"] = stored["rows"]
         return begun
 
     def axes(self) -> dict[str, dict[int, Job]]:
@@ -111,10 +111,9 @@ def warm_worker(job: Job, way: str) -> Iterator[Worker]:
 
     Compiling takes memory.
     """
-    arguments = ("attack.ours", "OurAttack", *astuple(job))
-    with Worker(*arguments) as worker:
+    with Worker("attack.ours", "OurAttack", *astuple(job)) as worker:
         worker.ask("compile", way)
-    with Worker(*arguments) as worker:
+    with Worker("attack.ours", "OurAttack", *astuple(job)) as worker:
         worker.ask("iterate", way)
         yield worker
 
@@ -142,15 +141,15 @@ def exponents(
     Returns:
         by axis and key of the rows.
     """
-    found: dict[str, dict[str, float]] = {}
+    powers: dict[str, dict[str, float]] = {}
     for axis, jobs in axes.items():
         if len(jobs) > 1:
             some, sizes = [rows[job] for job in jobs.values()], np.log(list(jobs))
-            found[axis] = {
+            powers[axis] = {
                 key: float(np.polyfit(sizes, np.log([row[key] for row in some]), 1)[0])
                 for key in some[0].keys() - {"job"}
             }
-    return found
+    return powers
 
 
 def scaling_table(

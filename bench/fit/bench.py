@@ -78,13 +78,19 @@ def measure(options: BenchFit, root: Path, show: Progress) -> dict[str, Any]:
         seed=1,
         progress=lambda done, total: show("views", done, total, ""),
     )
-    job = (str(root / "views"), sizes.step_m)
     edges = f"{sizes.width}x{sizes.height}"
     data = f"{sizes.views} views of the bundled intersection, {edges}"
     rows: list[dict[str, Any]] = []
     for network, layout in sizes.networks.items():
-        words = (*job, astuple(layout), sizes.rays, sizes.samples)
-        with Worker("fit.ours", "OurTrainer", *words) as ours:
+        with Worker(
+            "fit.ours",
+            "OurTrainer",
+            str(root / "views"),
+            sizes.step_m,
+            astuple(layout),
+            sizes.rays,
+            sizes.samples,
+        ) as ours:
             ours.ask("write_pictures", str(root / "pictures.safetensors"))
             for stage in ("early", "late"):
                 name = f"{network}, {stage}"
@@ -113,12 +119,14 @@ def _stage(
 ) -> dict[str, Any]:
     """Copy our field to the peer, and let both sides train in turns."""
     show(name, 0, repeats, "starting")
-    rays, state = ours.ask("facts")["rays"], root / "field.safetensors"
-    ours.ask("write_field", str(state))
-    shared = (str(state), str(root / "pictures.safetensors"), rays, *chunk)
+    rays, state = ours.ask("facts")["rays"], str(root / "field.safetensors")
+    ours.ask("write_field", state)
+    pictures = str(root / "pictures.safetensors")
     row: dict[str, Any] = {"rays": rays, "settings": {}}
     with ExitStack() as stack:
-        peer = stack.enter_context(Worker("fit.peer", "TorchTrainer", *shared))
+        peer = stack.enter_context(
+            Worker("fit.peer", "TorchTrainer", state, pictures, rays, *chunk)
+        )
         sides = {"": ours, "torch_": peer}
         facts = {prefix: worker.ask("facts") for prefix, worker in sides.items()}
         turns: dict[str, list[dict[str, float]]] = {prefix: [] for prefix in sides}
@@ -152,17 +160,19 @@ def lines(document: dict[str, Any]) -> list[str]:
     for row in document["steps"]:
         seconds = (row[f"{p}seconds_per_step"] for p in ("", "torch_"))
         ratios = f"{row['torch_ratio']:.2f}", f"{row['torch_cpu_ratio']:.2f}"
-        about = row["network"], row["stage"], str(row["rays"])
-        rows.append((*about, *(number(1e3 * value) for value in seconds), *ratios))
-        found = []
+        labels = row["network"], row["stage"], str(row["rays"])
+        rows.append((*labels, *(number(1e3 * value) for value in seconds), *ratios))
+        reasons = []
         apart = row["torch_samples_per_step"] / row["samples_per_step"] - 1
         if abs(apart) > MOST_APART:
-            found.append(f"samples of PyTorch differ from ours by {apart:+.1%}")
+            reasons.append(f"samples of PyTorch differ from ours by {apart:+.1%}")
         for side, prefix in {"ours": "", "PyTorch": "torch_"}.items():
             learnt = row[f"{prefix}loss_last"] < row[f"{prefix}loss_first"]
             if row["stage"] == "early" and not learnt:
-                found.append(f"{side} did not learn")
-        unfair += [f"{about[0]}, {about[1]}: {text}: do not quote" for text in found]
+                reasons.append(f"{side} did not learn")
+        unfair += [
+            f"{labels[0]}, {labels[1]}: {text}: do not quote" for text in reasons
+        ]
     return [
         f"A training step takes PyTorch {document['ratio']:.2f} times as long as us, "
         f"or longer; fitted to {document['data']}",

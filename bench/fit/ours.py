@@ -104,7 +104,7 @@ class OurTrainer:
         return {
             "rays": self.rays,
             "rays_used": int(total.rays[0]) / count,
-            "samples": int(total.kept[0]) * self.rays / int(total.rays[0]),
+            "samples": int(total.visible[0]) * self.rays / int(total.rays[0]),
             "threads": dr.thread_count(),
             "occupied": self.field.occupancy.fraction,
         }

@@ -80,11 +80,16 @@ def measure(
 
     The first process compiles the kernels, because compiling takes time and memory.
     """
-    side = ("PlainLoop",) if way == "plain" else ("RolloutLoop", way)
-    arguments = ("loop.ways", *side, policy, *size)
-    with Worker(*arguments) as worker:
+
+    def side() -> Worker:
+        width, height = size
+        if way == "plain":
+            return Worker("loop.ways", "PlainLoop", policy, width, height)
+        return Worker("loop.ways", "RolloutLoop", way, policy, width, height)
+
+    with side() as worker:
         worker.ask("gradient", WARM_UP)
-    with Worker(*arguments) as worker:
+    with side() as worker:
         worker.ask("gradient", WARM_UP)
         turns = [worker.ask("gradient", options.frames)]
         memory = worker.ask("memory")
@@ -118,5 +123,7 @@ def lines(document: dict[str, Any]) -> list[str]:
     gradient, loss = (
         f"{document[f'{k}_difference']:.1e}" for k in ("gradient", "loss")
     )
-    told = f"Largest relative difference of two rows: gradient {gradient}, cost {loss}"
-    return [markdown(header, rows), told]
+    summary = (
+        f"Largest relative difference of two rows: gradient {gradient}, cost {loss}"
+    )
+    return [markdown(header, rows), summary]

@@ -71,11 +71,11 @@ def _compare(
     show(stage, 0, repeats, "starting")
     with ExitStack() as stack:
         sides = {}
-        for prefix, (module, name, more) in {
+        for prefix, (module, name, arguments) in {
             "": ("render.ours", "scene_side", []),
             "torch_": ("render.peer", "TorchSide", chunks),
         }.items():  # one after the other: the peer tries sizes of chunks
-            worker = Worker(module, name, path, *size, *more)
+            worker = Worker(module, name, path, *size, *arguments)
             sides[prefix] = stack.enter_context(worker)
             worker.ask("backward")  # warms up
         turns: dict[str, list[dict[str, float]]] = {prefix: [] for prefix in sides}
@@ -131,8 +131,8 @@ def lines(document: dict[str, Any]) -> list[str]:
         for size, row in document["sizes"].items()
         for what, unit, key, by in ROWS
     ]
-    found = [markdown(("size", "what", "unit", "ours", "PyTorch"), rows), ""]
-    found += [
+    report = [markdown(("size", "what", "unit", "ours", "PyTorch"), rows), ""]
+    report += [
         f"{size}: times as fast as PyTorch: forward {row['torch_forward_ratio']:.2f}, "
         f"backward {row['torch_backward_ratio']:.2f} (the less favourable of the "
         "derivative alone and of forward with derivative)"
@@ -140,7 +140,7 @@ def lines(document: dict[str, Any]) -> list[str]:
     ]
     compiled = document["kernels_compiled_after_warmup"]
     return [
-        *found,
+        *report,
         f"kernels compiled after the warm-up: {compiled}",
         document["field"],
     ]

@@ -13,7 +13,7 @@ import numpy as np
 
 from bench.ngp_data import NGPData
 from bench.render.cameras import STOP, route_rays
-from mi_nerfattack.render.composite import Seen
+from mi_nerfattack.render.composite import Marches
 from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
@@ -45,7 +45,7 @@ class OurSide:
         self.rays = self._rays(*rays)
         cotangent = np.random.default_rng(seed).normal(size=(3, len(rays[0])))
         self.cotangent = mi.Color3f(cotangent.astype(np.float32).tolist())
-        self.seen: Any = None
+        self.marches: Any = None
         self.behind: Any = None
         dr.eval(self.cotangent)
 
@@ -64,11 +64,11 @@ class OurSide:
         """Render a frame and return the seconds it took."""
         dr.sync_thread()
         start = time.perf_counter()
-        self.seen = self.composite.render([self.posed], self.rays, STOP)
-        total = self.seen.total
+        self.marches = self.composite.render([self.posed], self.rays, STOP)
+        total = self.marches.total
         self.behind = self.posed.field.background(self.rays.direction)
         image = total.radiance + (1 - total.opacity) * self.behind
-        dr.eval(self.seen, self.behind, image)
+        dr.eval(self.marches, self.behind, image)
         dr.sync_thread()
         return time.perf_counter() - start
 
@@ -88,7 +88,9 @@ class OurSide:
             dr.set_grad(read(), dr.opaque(mi.Float, 0, dr.width(leaf)))
         by_opacity = -dr.dot(self.cotangent, self.behind)
         total = March(self.cotangent, by_opacity, dr.opaque(mi.Float, 0))
-        self.composite.backward([self.posed], self.rays, self.seen, Seen(total), STOP)
+        self.composite.backward(
+            [self.posed], self.rays, self.marches, Marches(total), STOP
+        )
         dr.eval([dr.grad(read()) for read, _ in self.leaves])
         dr.sync_thread()
         alone = time.perf_counter() - start
@@ -147,9 +149,9 @@ def count_samples(posed: PosedField, rays: Rays, stop: float) -> mi.UInt32:
     tau = mi.Float(0)  # optical depth so far
     count = mi.UInt32(0)
     while active:
-        walk, here = walk.next([posed], active)
-        count += dr.select(here.active, 1, 0)
-        density = posed.eval(path.at(here.t), path.heading, here.active)[0]
-        tau += here.depths([density])[0]
-        active = here.active & (dr.exp(-tau) > stop)
+        walk, segment = walk.next([posed], active)
+        count += dr.select(segment.active, 1, 0)
+        density = posed.eval(path.at(segment.t), path.heading, segment.active)[0]
+        tau += segment.depths([density])[0]
+        active = segment.active & (dr.exp(-tau) > stop)
     return count

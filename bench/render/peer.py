@@ -74,7 +74,7 @@ class TorchSide:
                 self.direction[part].split(chunk),
                 strict=True,
             )
-            torch.cat([self.model.render(*some) for some in rays])
+            torch.cat([self.model.render(o, d) for o, d in rays])
         wait()
         return time.perf_counter() - start
 

@@ -43,8 +43,8 @@ def with_labels(drives: pd.DataFrame) -> pd.DataFrame:
 
     The name of an attack ends with the method, the seed of the place and a digest.
     """
-    parts = drives["attack"].str.split("-")
-    return drives.assign(method=parts.str[-3], seed=parts.str[-2])
+    fields = drives["attack"].str.split("-")
+    return drives.assign(method=fields.str[-3], seed=fields.str[-2])
 
 
 def ends_cell(ends: Interval, digits: int = 3) -> str:

@@ -31,7 +31,7 @@ from bench.studies.content import (
 )
 from bench.studies.light import light
 from bench.studies.limits import limits
-from bench.studies.parts import parts
+from bench.studies.parts import vary_parts
 from bench.studies.plan import Study, state
 from bench.studies.transfer import transfer
 from mi_nerfattack.drives.table import records, with_starts
@@ -101,9 +101,10 @@ def attack(drives: pd.DataFrame) -> Finding:
     where = next(name for name in drives["environment"].unique() if name != SURROGATE)
     own = drives[drives["environment"] == where]
     by_case = {case: own[own["case"] == case] for case in _CASES}
-    sides = by_case[ATTACK], by_case[BEST_RANDOM]
-    found, (count, is_shown) = compare(*sides, ERROR), is_farther(*sides)
-    places = f"{count} of {found.attacks} places"
+    attacks, randoms = by_case[ATTACK], by_case[BEST_RANDOM]
+    effect = compare(attacks, randoms, ERROR)
+    count, is_shown = is_farther(attacks, randoms)
+    places = f"{count} of {effect.attacks} places"
     title = (
         f"The attack moves the car farther than the worst random texture at {places}"
     )
@@ -125,16 +126,16 @@ def attack(drives: pd.DataFrame) -> Finding:
     return Finding(
         title,
         (
-            f"In the environment `{where}`, the attack moves the car {found.one:.3f} m "
-            f"from the lane centre on average, and the worst random texture "
-            f"{found.other:.3f} m (ratio {found.ratio:.1f}, "
-            f"{interval_words(found.ratio_ci95, 1)}).",
-            f"The attack is farther at {places}. At {out} of {found.attacks} places, "
+            f"In the environment `{where}`, the attack moves the car {effect.one:.3f} "
+            f"m from the lane centre on average, and the worst random texture "
+            f"{effect.other:.3f} m (ratio {effect.ratio:.1f}, "
+            f"{interval_words(effect.ratio_ci95, 1)}).",
+            f"The attack is farther at {places}. At {out} of {effect.attacks} places, "
             "a wheel is out of the lane for 1 s or more with the attack, on average "
             "over the drives (share: "
-            f"{interval_words(share_interval(out, found.attacks), 2)}).",
-            f"The difference is {found.difference:.3f} m on average. Its standard "
-            f"deviation between the places of a route is {metres(found.spread)}.",
+            f"{interval_words(share_interval(out, effect.attacks), 2)}).",
+            f"The difference is {effect.difference:.3f} m on average. Its standard "
+            f"deviation between the places of a route is {metres(effect.spread)}.",
         ),
         [
             *("texture", "environment", "mean error (m)", "95 % interval"),
@@ -144,7 +145,7 @@ def attack(drives: pd.DataFrame) -> Finding:
         lambda figure: draw_places(figure, errors),
         f'deployed = drives[drives.environment == "{where}"]\n'
         'print(deployed.groupby(["route", "case"]).cross_track_mean_m.mean())',
-        tuple(_threats_to_attack(by_case, found)),
+        tuple(_threats_to_attack(by_case, effect)),
     )
 
 
@@ -156,20 +157,20 @@ def country(drives: pd.DataFrame) -> Finding:
 
 
 def _threats_to_attack(
-    by_case: Mapping[str, pd.DataFrame], found: Effect
+    by_case: Mapping[str, pd.DataFrame], effect: Effect
 ) -> Iterator[str]:
     """Yield what speaks against the finding about the attack.
 
     Args:
         by_case: drives in the deployment environment.
-        found: attack and worst random texture, compared.
+        effect: attack and worst random texture, compared.
     """
-    if found.ratio_ci95 is not None and found.ratio_ci95[0] <= 1:
+    if effect.ratio_ci95 is not None and effect.ratio_ci95[0] <= 1:
         yield (
             "The interval of the ratio of the means contains 1, because a few attacks "
             "are much stronger than the others. So the title counts places."
         )
-    if found.spread is not None and found.spread > found.difference:
+    if effect.spread is not None and effect.spread > effect.difference:
         yield (
             "The spread between places is larger than the mean difference, so one more "
             "place can change the mean a lot."
@@ -198,10 +199,10 @@ def gradient(drives: pd.DataFrame) -> Finding:
     own = _attacks(drives)
     sides = {str(name): side for name, side in own.groupby("method", sort=False)}
     base = sides.pop(GRADIENT)
-    found = {name: compare(base, side, ERROR) for name, side in sides.items()}
+    effects = {name: compare(base, side, ERROR) for name, side in sides.items()}
     farther = {name: is_farther(base, side) for name, side in sides.items()}
     frames = own.groupby("method", sort=False)["frames"].mean()
-    fair = {name: found[name] for name in found if _is_equal(frames, name)}
+    fair = {name: effects[name] for name in effects if _is_equal(frames, name)}
     without = [name for name in fair if name not in _BY_GRADIENT]
     others = [name for name in fair if name in _BY_GRADIENT]
     better, also = (
@@ -221,7 +222,7 @@ def gradient(drives: pd.DataFrame) -> Finding:
             f"{farther[name][0]}/{effect.attacks}",
             *(metres(effect.difference), metres(effect.spread)),
         ]
-        for name, effect in found.items()
+        for name, effect in effects.items()
     ]
     return Finding(
         title,
@@ -243,7 +244,7 @@ def gradient(drives: pd.DataFrame) -> Finding:
         ],
         rows,
         lambda figure: draw_ratios(
-            figure, {n: (e.ratio or 0.0, e.ratio_ci95) for n, e in found.items()}
+            figure, {n: (e.ratio or 0.0, e.ratio_ci95) for n, e in effects.items()}
         ),
         _OF_SEARCHES,
         tuple(_threats_to_gradient(own, frames, list(fair))),
@@ -313,7 +314,8 @@ def flat(drives: pd.DataFrame) -> Finding:
     """Count the drives that leave the lane, as bench/flat.toml says."""
     own = drives[drives["environment"] == "built_in"]
     left, count = (
-        own.groupby("case")["departed"].agg(how).astype(int) for how in ("sum", "count")
+        own.groupby("case")["departed"].agg(statistic).astype(int)
+        for statistic in ("sum", "count")
     )
     shares = {name: left[c] / count[c] for c, name in _CASES.items() if c in left}
     places = own[own["case"] == ATTACK].groupby("cell")["departed"].any()
@@ -359,7 +361,7 @@ FINDINGS: dict[str, tuple[str, Callable[[pd.DataFrame], Finding]]] = {
     "flat": ("whether flat objects mislead the policy", flat),
     "transfer": ("whether attacks transfer", transfer),
     "light": ("whether attacks survive other light and wheels", light),
-    "parts": ("which part of `vary` helps", parts),
+    "parts": ("which part of `vary` helps", vary_parts),
     "limits": ("what limits attacks", limits),
     "country": ("whether the attack works at a second place", country),
 }

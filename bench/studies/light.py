@@ -33,10 +33,10 @@ def light(drives: pd.DataFrame) -> Finding:
         _errors(drives, case).map(math.log) for case in (ATTACK, NO_OBJECT)
     )
     base = logs[SURROGATE, "day"]
-    kept = logs.sub(base, axis=0).drop(columns=[(SURROGATE, "day")])
-    shares, of_plain = _means(kept, VARY), _means(kept, PLAIN)
+    log_shares = logs.sub(base, axis=0).drop(columns=[(SURROGATE, "day")])
+    shares, of_plain = _means(log_shares, VARY), _means(log_shares, PLAIN)
     bare, gains = _means(without.sub(base, axis=0), VARY), _gains(logs)
-    ends_of_vary = _ends(kept, VARY)
+    ends_of_vary = _ends(log_shares, VARY)
     aims = {(x, y): AIMS[x] if y == "day" else _OTHER_LIGHT for x, y in shares}
     rows = []
     for place, share in shares.items():
@@ -84,14 +84,14 @@ def light(drives: pd.DataFrame) -> Finding:
             "The aim is the least share that `vary` should keep. We set the aims "
             "before the first result.",
             "In `mujoco`, the car stands on wheels, and its steering lags.",
-            _stayed(drives, kept),
+            _stayed(drives, log_shares),
         ),
     )
 
 
-def _stayed(drives: pd.DataFrame, kept: pd.DataFrame) -> str:
+def _stayed(drives: pd.DataFrame, log_shares: pd.DataFrame) -> str:
     """Say how much of the least share by day is due to cars that stay in their lane."""
-    own: Any = kept.loc[VARY]
+    own: Any = log_shares.loc[VARY]
     by_day = own.xs("day", axis=1, level="condition")
     where = by_day.mean().idxmin()
     out: Any = _errors(drives, ATTACK, "departed").loc[VARY].astype(bool)
@@ -129,16 +129,16 @@ def _gains(logs: pd.DataFrame) -> dict[Where, Interval]:
     return _intervals((logs.loc[VARY] - logs.loc[PLAIN]).dropna())
 
 
-def _ends(kept: pd.DataFrame, method: str) -> dict[Where, Interval]:
+def _ends(log_shares: pd.DataFrame, method: str) -> dict[Where, Interval]:
     """Return the intervals of the geometric means of a method over its places."""
-    known = method in kept.index.get_level_values("method")
-    return _intervals(kept.loc[method].dropna()) if known else {}
+    known = method in log_shares.index.get_level_values("method")
+    return _intervals(log_shares.loc[method].dropna()) if known else {}
 
 
 def _intervals(logs: Any) -> dict[Where, Interval]:
     """Return the interval of the geometric mean of each column."""
-    found: dict[Where, Interval] = {}
+    intervals: dict[Where, Interval] = {}
     for place, logarithms in logs.items():
         ends = interval(np.mean, (logarithms.to_numpy(),), 0)
-        found[place] = None if ends is None else np.exp(ends).tolist()
-    return found
+        intervals[place] = None if ends is None else np.exp(ends).tolist()
+    return intervals

@@ -64,7 +64,7 @@ def with_answer(index: str, page: str, title: str) -> str:
         title: the finding.
     """
     item = re.compile(rf"^(- \[[^]]*\]\({re.escape(page)}\)).*(?:\n  .*)*", re.M)
-    return item.sub(lambda found: _wrapped(f"{found[1]} {title}.", "  "), index)
+    return item.sub(lambda match: _wrapped(f"{match[1]} {title}.", "  "), index)
 
 
 def _smaller(image: bytes) -> bytes:
@@ -95,14 +95,14 @@ def page_text(study: Study, made: Finding, one: State, picture: str) -> str:
     if len(one.sources) > 1:
         threats.append(f"{len(one.sources)} versions of the program made these rows.")
     threats += [*made.threats, *study.threats]
-    about = (
+    description = (
         f"[`{data}`]({relpath(ROOT / data, FOLDER)}) has the rows. "
         f"[`{Path(rule).name}`]({relpath(ROOT / rule, FOLDER)}) has the places, seeds "
         f"and budgets. `make results ONLY={study.name}` makes missing rows. "
         f"{study.note} [How to read this page](index.md)."
     )
     code = f'import pandas as pd\n\ndrives = pd.read_csv("{data}")\n{made.pandas}'
-    parts = [
+    sections = [
         f"# {made.title}",
         MARK,
         f"![{made.title}.]({picture})",
@@ -111,10 +111,10 @@ def page_text(study: Study, made: Finding, one: State, picture: str) -> str:
         "## Threats to validity",
         "\n".join(_wrapped(f"- {threat}", "  ") for threat in threats),
         "## Data",
-        _wrapped(" ".join(about.split())),
+        _wrapped(" ".join(description.split())),
         f"```python\n{code}\n```",
     ]
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join(sections) + "\n"
 
 
 def _wrapped(text: str, indent: str = "") -> str:

@@ -13,7 +13,7 @@ from mi_nerfattack.rollout.drive import ATTACK
 
 NONE, ALL = "nothing", "all parts"
 #: What varies, by method of bench/vary_parts.toml.
-PARTS = {
+VARIATIONS = {
     "none": NONE,
     "light": "light",
     "camera": "camera",
@@ -22,11 +22,11 @@ PARTS = {
 }
 
 
-def parts(drives: pd.DataFrame) -> Finding:
+def vary_parts(drives: pd.DataFrame) -> Finding:
     """Compare each part with the attack that varies nothing."""
     own = with_labels(drives[drives["case"] == ATTACK])
-    own = own.assign(part=own["method"].map(PARTS), log=own[ERROR].map(math.log))
-    named = [name for name in PARTS.values() if name in set(own["part"])]
+    own = own.assign(part=own["method"].map(VARIATIONS), log=own[ERROR].map(math.log))
+    named = [name for name in VARIATIONS.values() if name in set(own["part"])]
     where = ["environment", "condition"]
     logs: Any = own.pivot_table("log", where, "part", sort=False)[named]
     gains = logs.drop(columns=NONE).sub(logs[NONE], axis=0)

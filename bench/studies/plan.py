@@ -158,7 +158,7 @@ def done_labels(table: pd.DataFrame) -> dict[tuple[Any, ...], str]:
     rows = table[table["status"] == "complete"].drop_duplicates("cell")
     plain = rows[list(LABELS)].astype(object)
     cells = plain.where(plain.notna(), None).itertuples(index=False, name=None)
-    return {labels: cell for cell, *rest in cells if (labels := tuple(rest))}
+    return {labels: cell for cell, *entries in cells if (labels := tuple(entries))}
 
 
 def state(study: Study, compare: bool = True) -> State:
@@ -172,22 +172,22 @@ def state(study: Study, compare: bool = True) -> State:
     table, sources, current = study.read(), frozenset[str](), None
     if study.grid is None:
         assert study.cells is not None
-        wanted = study.cells
-        found = len(list(study.folder.glob(study.rows)))
-        done = found if table is None else int(table[study.unit].nunique())
-        done = min(done, wanted)
+        total = study.cells
+        count = len(list(study.folder.glob(study.rows)))
+        done = count if table is None else int(table[study.unit].nunique())
+        done = min(done, total)
     else:
         labels = list(GridReader(ROOT / study.grid).labels())
         have = {} if table is None else done_labels(table)
-        wanted, done = len(labels), len(have.keys() & set(labels))
+        total, done = len(labels), len(have.keys() & set(labels))
         if (study.folder / MADE_OF).exists():
             made = read_made(study.folder).values()
-            versions = (about["versions"] or {} for about in made)
+            versions = (record["versions"] or {} for record in made)
             sources = frozenset(one.get("source", UNKNOWN) for one in versions)
         if compare:
             current = _current(study, set(have.values()))
-    left = wanted - (done if current is None else current)
-    return State(done, wanted, current, sources, left * study.core_hours)
+    left = total - (done if current is None else current)
+    return State(done, total, current, sources, left * study.core_hours)
 
 
 def _current(study: Study, have: set[str]) -> int | None:

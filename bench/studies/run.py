@@ -32,7 +32,7 @@ from mi_nerfattack.commands.shared.terminal import Result, say
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.sweep.summary import (
     SUMMARY,
-    told_attacks,
+    summarised_attacks,
     write_summary,
 )
 from mi_nerfattack.experiment.sweep.table import (
@@ -129,14 +129,14 @@ class BenchResults:
         fresh = study.model_copy(update={"name": _fresh_name(study.name)})
         done, work = self._do(fresh, take=False), fresh.work
         made = read_table(work / RESULTS)
-        found = {"table": str(work / RESULTS), "cells": len(done_labels(made))}
+        document = {"table": str(work / RESULTS), "cells": len(done_labels(made))}
         if (stored := study.read()) is not None:
-            found |= differences(stored, made)
+            document |= differences(stored, made)
         own = {"table": str(work.relative_to(ROOT)), "finding": "attack"}
         pages = write_pages([study.model_copy(update=own)], work, work)
-        found["pages"] = [str(path) for path in pages]
-        lines = [f"{name}: {value}" for name, value in found.items()]
-        return Result(found, lambda: print(*lines, sep="\n"), int(not done))
+        document["pages"] = [str(path) for path in pages]
+        lines = [f"{name}: {value}" for name, value in document.items()]
+        return Result(document, lambda: print(*lines, sep="\n"), int(not done))
 
     def _checked(self, studies: Sequence[Study]) -> Result:
         """Make a tenth of each table again; the results are written next to it.
@@ -217,7 +217,7 @@ def refresh(study: Study) -> None:
         if counts[0] < max(counts[1], 1):
             say(f"{study.name}: {counts[0]} cells; {study.table} has {counts[1]}")
             return
-        write_summary(work, told_attacks(study.folder))
+        write_summary(work, summarised_attacks(study.folder))
     names = (RESULTS, MADE_OF, SUMMARY) if study.grid else study.keep
     if names and all((work / name).exists() for name in names):
         for name in names:
@@ -236,8 +236,8 @@ def _portable_cells(study: Study) -> dict[str, Any]:
     `reproduce` reads them.
     """
     made, root = read_made(study.work), relpath(ROOT, study.folder.parent)
-    for about in made.values():
-        about["scenario"] = about["scenario"].replace(f'"{ROOT}/', f'"{root}/')
+    for record in made.values():
+        record["scenario"] = record["scenario"].replace(f'"{ROOT}/', f'"{root}/')
     return made
 
 
@@ -311,14 +311,16 @@ def _listed(studies: Sequence[Study]) -> Result:
     head = ["study", "question", "done", "as today", "core-hours left", "of one unit"]
     rows = [_list_row(study, states[study.name]) for study in studies]
     hours = sum(one.hours_left for one in states.values())
-    whole = sum(states[one.name].wanted * one.core_hours for one in studies)
-    left = f"{number(hours)} of {number(whole)} core-hours are left"
+    total_hours = sum(states[one.name].wanted * one.core_hours for one in studies)
+    left = f"{number(hours)} of {number(total_hours)} core-hours are left"
     text = f"{markdown(head, rows)}\n{left}"
     document = {
         name: asdict(one) | {"sources": sorted(one.sources)}
         for name, one in states.items()
     }
-    return Result(document | {"hours_left": hours, "hours": whole}, lambda: print(text))
+    return Result(
+        document | {"hours_left": hours, "hours": total_hours}, lambda: print(text)
+    )
 
 
 def _list_row(study: Study, one: State) -> list[str]:
@@ -351,7 +353,7 @@ def _expanded(word: str) -> list[str]:
     """Return the paths that a word with ``*`` matches, or the word."""
     if "*" not in word:
         return [word]
-    found = sorted(str(path) for path in ROOT.glob(word))
-    if not found:
+    paths = sorted(str(path) for path in ROOT.glob(word))
+    if not paths:
         raise InputError(f"{word}: no file; run the study that makes it before")
-    return found
+    return paths

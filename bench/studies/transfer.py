@@ -23,15 +23,15 @@ def transfer(drives: pd.DataFrame) -> Finding:
     by_day = heat["day"].drop(SURROGATE)
     bare = empty["day"].reindex(by_day.index)
     ends = {
-        name: np.exp(found).tolist()
+        name: np.exp(bounds).tolist()
         for name in by_day.index
-        if (found := interval(np.mean, (logs[name]["day"].to_numpy(),), 0)) is not None
+        if (bounds := interval(np.mean, (logs[name]["day"].to_numpy(),), 0)) is not None
     }
-    kept = sum(low > HALF for low, _ in ends.values())
+    above = sum(low > HALF for low, _ in ends.values())
     lost = sum(high < HALF for _, high in ends.values())
     count = len(by_day)
     title = (
-        f"By day, the best attacks keep over half of their error in {kept} of {count} "
+        f"By day, the best attacks keep over half of their error in {above} of {count} "
         f"environments, under half in {lost}"
     )
     return Finding(
@@ -40,7 +40,7 @@ def transfer(drives: pd.DataFrame) -> Finding:
             f"By day, the error with the attack is {by_day.max():.2f} times the error "
             f"in the surrogate in `{by_day.idxmax()}`, and {by_day.min():.2f} times in "
             f"`{by_day.idxmin()}`.",
-            f"In {count - kept - lost} environments, the 95 % interval of this ratio "
+            f"In {count - above - lost} environments, the 95 % interval of this ratio "
             "contains one half.",
             f"These are geometric means over {len(logs)} places with "
             f"{drives['attack'].nunique()} attacks, and attacks at one place count as "
@@ -71,9 +71,9 @@ def _to_surrogate(drives: pd.DataFrame, case: str) -> pd.DataFrame:
         Mean logarithms of a place (row), by environment and condition.
     """
     rows, columns = ["route", "seed", "attack"], ["environment", "condition"]
-    told = with_labels(drives)
+    labelled = with_labels(drives)
     table, attacks = (
-        told[told["case"] == name].pivot_table(ERROR, rows, columns, sort=False)
+        labelled[labelled["case"] == name].pivot_table(ERROR, rows, columns, sort=False)
         for name in (case, ATTACK)
     )
     logs = table.div(attacks[SURROGATE]["day"], axis=0).map(math.log)

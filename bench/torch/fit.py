@@ -118,8 +118,8 @@ class TorchFit:
         """
         origin = self.origin[index // self.pixels]
         linear = self.model.render(origin, self.direction[index], jitter)
-        wanted = self.colour[index].to(linear.dtype) / 255
-        return F.smooth_l1_loss(encode(linear * BELOW_WHITE), wanted, beta=self.huber)
+        target = self.colour[index].to(linear.dtype) / 255
+        return F.smooth_l1_loss(encode(linear * BELOW_WHITE), target, beta=self.huber)
 
     def count_samples(self, rays: int) -> float:
         """Return the samples of a step in front of the end of their rays.

@@ -93,11 +93,16 @@ class TorchView:
             origin, direction = self.camera.rays(state)
             radiance, passed, moment, sky = self.background(origin, direction)
             pixels = encode(radiance + passed[:, None] * sky)
-        seen = self.item.see(origin, direction)
-        if len(seen.ray):
-            behind = radiance[seen.ray], passed[seen.ray], moment[seen.ray]
-            colour = compose(seen, *behind, sky[seen.ray])
-            pixels = pixels.index_copy(0, seen.ray, encode(colour))
+        view = self.item.see(origin, direction)
+        if len(view.ray):
+            colour = compose(
+                view,
+                radiance[view.ray],
+                passed[view.ray],
+                moment=moment[view.ray],
+                sky=sky[view.ray],
+            )
+            pixels = pixels.index_copy(0, view.ray, encode(colour))
         shape = (len(state), self.camera.height, self.camera.width, 3)
         return pixels.view(shape).permute(0, 3, 1, 2)
 
@@ -111,12 +116,12 @@ class TorchView:
         """
         rays = zip(origin.split(self.chunk), direction.split(self.chunk), strict=True)
         march, sky = self.scene.march, self.scene.background
-        parts = [(*march(*some), sky(some[1])) for some in rays]
-        return tuple(torch.cat(some) for some in zip(*parts, strict=True))
+        chunks = [(*march(o, d), sky(d)) for o, d in rays]
+        return tuple(torch.cat(some) for some in zip(*chunks, strict=True))
 
 
 def compose(
-    seen: ObjectView,
+    view: ObjectView,
     radiance: torch.Tensor,
     passed: torch.Tensor,
     moment: torch.Tensor,
@@ -124,11 +129,11 @@ def compose(
 ) -> torch.Tensor:
     """Lay object and background over each other by expected depth; appendix A.6."""
     depth = moment / (1 - passed)  # nothing there: not a number, and so behind
-    item = seen.moment / (1 - seen.passed)
+    item = view.moment / (1 - view.passed)
     behind = (depth < item)[:, None]
-    front = seen.radiance + seen.passed[:, None] * radiance
-    back = radiance + passed[:, None] * seen.radiance
-    both = (seen.passed * passed)[:, None] * sky
+    front = view.radiance + view.passed[:, None] * radiance
+    back = radiance + passed[:, None] * view.radiance
+    both = (view.passed * passed)[:, None] * sky
     return torch.where(behind, back, front) + both
 
 

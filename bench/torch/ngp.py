@@ -132,7 +132,7 @@ class TorchNGP:
             premultiplied linear radiance (n, 3), transmittance (n,), and the depth
             times the opacity (n,), metres.
         """
-        depth, seen = torch.zeros(len(origin)), torch.zeros(len(origin), 4)
+        depth, sums = torch.zeros(len(origin)), torch.zeros(len(origin), 4)
         samples = self.samples(origin, direction, jitter)
         harmonics = spherical_harmonics(direction)
         for ranks in self.batches:
@@ -140,9 +140,9 @@ class TorchNGP:
             if lit is None:
                 break
             value = torch.cat([lit.colour, lit.distance[:, None]], 1)
-            seen = seen.index_add(0, lit.ray, lit.weight[:, None] * value)
+            sums = sums.index_add(0, lit.ray, lit.weight[:, None] * value)
             depth = depth.index_add(0, lit.ray, lit.x)
-        return seen[:, :3], torch.exp(-depth), seen[:, 3]
+        return sums[:, :3], torch.exp(-depth), sums[:, 3]
 
     def _lit(
         self,
@@ -257,9 +257,9 @@ def occupied_samples(
         place = start[:, axis, None] + t * slope[:, axis, None]
         cell = cell * size + (place * size).to(torch.int32).clamp_(0, size - 1)
     occupied = cells.reshape(-1).index_select(0, cell.reshape(-1))
-    kept = (occupied & (width > 0).reshape(-1)).nonzero()[:, 0]
-    ray = torch.div(kept, max(t.shape[1], 1), rounding_mode="floor")
-    t, width = t.reshape(-1)[kept], width.reshape(-1)[kept]
+    index = (occupied & (width > 0).reshape(-1)).nonzero()[:, 0]
+    ray = torch.div(index, max(t.shape[1], 1), rounding_mode="floor")
+    t, width = t.reshape(-1)[index], width.reshape(-1)[index]
     unit = (start[ray] + t[:, None] * slope[ray]).clamp_(0.0, 1.0 - 1e-6)
     each = torch.bincount(ray, minlength=len(start))
     rank = torch.arange(len(ray)) - (torch.cumsum(each, 0) - each)[ray]

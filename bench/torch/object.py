@@ -167,7 +167,7 @@ class TorchObject:
         """Find the samples in front of the ends of their rays, and their weights."""
         met, samples = self._samples(origin, direction)
         depth, moment = torch.zeros(len(met)), torch.zeros(len(met))
-        parts = []
+        batches = []
         for low, high in BATCHES:
             on = (samples.rank >= low) & (samples.rank < high)
             chosen = (on & (depth < self.limit)[samples.ray]).nonzero()[:, 0]
@@ -184,13 +184,13 @@ class TorchObject:
             weight = torch.exp(-before) * -torch.expm1(-x)
             depth.index_add_(0, ray, x)
             moment.index_add_(0, ray, weight * samples.distance[chosen][lit])
-            parts.append((ray, row[lit], corner[lit], weight))
-        if not parts:
+            batches.append((ray, row[lit], corner[lit], weight))
+        if not batches:
             empty = torch.zeros(0, 8 * len(self.scale))
             none = torch.zeros(0, dtype=torch.int64)
-            parts = [(none, empty.int(), empty, torch.zeros(0))]
+            batches = [(none, empty.int(), empty, torch.zeros(0))]
         ray, row, corner, weight = (
-            torch.cat(some) for some in zip(*parts, strict=True)
+            torch.cat(some) for some in zip(*batches, strict=True)
         )
         self.evaluated += len(ray)
         return _Lit(met, depth, moment, ray, row, corner, weight)

@@ -12,12 +12,12 @@ import mitsuba as mi
 
 mi.set_variant("llvm_ad_rgb")
 horizon, iterations = map(int, sys.argv[1:] or (40, 12))
-here, place = Path(__file__).parent, nf.bundled_place()
+folder, place = Path(__file__).parent, nf.bundled_place()
 route = nf.Route.from_file(place.routes, "right")
 driver = nf.TorchPolicy(nf.PilotNet.load(nf.bundled("policy/pilotnet.safetensors")))
 keys, start = ["fields.near.colour", "fields.far.colour"], route.pose_at(6.0)
 
-scene = mi.load_file(str(here / "surrogate.xml"), parallel=False)
+scene = mi.load_file(str(folder / "surrogate.xml"), parallel=False)
 params, sensor = mi.traverse(scene), nf.SceneSensor(scene, place.mount, keys)
 car = nf.Dubins(route.speed_ms, place.car.max_control)
 loop = nf.ClosedLoop(sensor, driver, route.goal, car, nf.RK4(), place.period)
@@ -27,7 +27,7 @@ drive = nf.Rollout(loop, cost, horizon, adjoint=nf.KeptBackgrounds())
 
 def error_path_traced():
     """Drive in meshes, the hydrants pasted; return the mean error in metres."""
-    meshes = replace(place, scene=here / "deployment.xml", camera=sensor.intrinsics)
+    meshes = replace(place, scene=folder / "deployment.xml", camera=sensor.intrinsics)
     world = nf.make_environment("mitsuba", meshes, nf.Conditions(spp=8))
     world.show(sensor.objects)
     return nf.drive(world, driver, route, start, 0, horizon).distance_m.mean()

@@ -22,11 +22,11 @@ def link(
         return None
     word = node["reftarget"].rpartition(".")[2]
     objects = env.domains.python_domain.objects
-    found = [(k, v) for k, v in objects.items() if k.rpartition(".")[2] == word]
-    found = [(k, v) for k, v in found if v.objtype in ("class", "exception")]
-    if len(found) != 1 or not node["reftarget"].startswith(("mi_nerfattack.", word)):
+    matches = [(k, v) for k, v in objects.items() if k.rpartition(".")[2] == word]
+    matches = [(k, v) for k, v in matches if v.objtype in ("class", "exception")]
+    if len(matches) != 1 or not node["reftarget"].startswith(("mi_nerfattack.", word)):
         return text
-    ((_, entry),) = found
+    ((_, entry),) = matches
     return make_refnode(app.builder, node["refdoc"], entry.docname, entry.node_id, text)
 
 

@@ -75,9 +75,9 @@ class Subject:
         """March the field with a map of light: linear (h, w, 3), and opacity."""
         rays = Rays(*generate_rays(self.camera, *pose_arrays(self.pose), 1))
         gain = Gain(mi.Color3f(1), mi.UInt32(row))
-        seen = march(self.posed.with_gain(gain), rays)
-        colour, shape = seen.radiance.numpy().T, (self.size, self.size)
-        return colour.reshape(*shape, 3), seen.opacity.numpy().reshape(shape)
+        marched = march(self.posed.with_gain(gain), rays)
+        colour, shape = marched.radiance.numpy().T, (self.size, self.size)
+        return colour.reshape(*shape, 3), marched.opacity.numpy().reshape(shape)
 
     def relit(self, emitters: dict[str, Any]) -> np.ndarray:
         """Render the field `relit`, linear (h, w, 3)."""
@@ -85,8 +85,8 @@ class Subject:
         fields = {"type": "field_integrator", "relit_samples": 32, "object": volume}
         spp = self.spp // 4  # each with 32 light samples
         sensor = mitsuba_sensor_dict(self.camera, self.pose, spp)
-        parts = {"sensor": sensor, "integrator": fields}
-        scene = mi.load_dict({"type": "scene", **emitters, **parts})
+        view = {"sensor": sensor, "integrator": fields}
+        scene = mi.load_dict({"type": "scene", **emitters, **view})
         return np.array(mi.render(scene, spp=spp))[..., :3]
 
     def columns(self, name: str) -> Iterator[np.ndarray]:
@@ -95,17 +95,17 @@ class Subject:
         captured, opacity = self.mapped(0)
         solid = (alpha > OPAQUE) & (opacity > OPAQUE)
 
-        def told(image: np.ndarray) -> str:
+        def relative_error(image: np.ndarray) -> str:
             error = np.abs(image - reference)[solid].mean()
             return f"{error / reference[solid].mean():.1%}"
 
-        print(f"{name}, light of the capture: {told(captured)}", flush=True)
+        print(f"{name}, light of the capture: {relative_error(captured)}", flush=True)
         yield np.concatenate([reference, captured, np.ones_like(captured)])
         for sun, row in zip(SUNS, self.maps.rows(SUNS, np.eye(3)), strict=True):
             reference, _ = self.traced(sun.emitters())
             mapped, relit = self.mapped(row)[0], self.relit(sun.emitters())
             best = captured * (reference[solid].mean(0) / captured[solid].mean(0))
-            errors = [told(image) for image in (mapped, relit, best)]
+            errors = [relative_error(image) for image in (mapped, relit, best)]
             print(f"{name}, {sun}: map, relit, one factor: {errors}", flush=True)
             yield np.concatenate([reference, mapped, relit])
 

@@ -63,10 +63,10 @@ def draw_drive(run: Path, folder: Path, small: bool) -> None:
     for step in range(0, len(drives[0].controls) + 1, 5 if small else 2):
         columns = []
         for drive, ground in zip(drives, grounds, strict=True):
-            seen = Image.fromarray(source.see(drive, step))
-            height = round(seen.height * ground.width / seen.width)
-            seen = titled(seen.resize((ground.width, height)), TITLES[drive.case])
-            columns.append(below([seen, driven(ground, overhead, drive, step)]))
+            picture = Image.fromarray(source.see(drive, step))
+            height = round(picture.height * ground.width / picture.width)
+            picture = titled(picture.resize((ground.width, height)), TITLES[drive.case])
+            columns.append(below([picture, driven(ground, overhead, drive, step)]))
         frames.append(beside(columns))
     source.close()
     first, *others = frames
@@ -112,11 +112,11 @@ def scene_of_drive(viewed: ViewedRun, drive: Drive) -> object:
 def solid_car() -> TexturedMesh:
     """Read the car without its triangles of no area, whose normals are not finite."""
     car = Placement(longest_m=CAR_M[0]).mesh(CAR)
-    parts = (
-        replace(part, faces=part.faces[has_area(part.vertices[part.faces])])
-        for part in car.parts
+    submeshes = (
+        replace(submesh, faces=submesh.faces[has_area(submesh.vertices[submesh.faces])])
+        for submesh in car.submeshes
     )
-    return replace(car, parts=tuple(parts))
+    return replace(car, submeshes=tuple(submeshes))
 
 
 def path_strip(drive: Drive, width_m: float = 0.25, z_m: float = 0.03) -> MeshPart:

@@ -68,7 +68,7 @@ def draw_worlds(folder: Path, small: bool) -> None:
     width, height, spp = (240, 100, 1) if small else (480, 200, 16)
     text = TURN.format(spp=spp) + CAMERA.format("front", 0, width, height)
     world = _world(text + ENVIRONMENTS.format(spp=8 * spp))
-    tiles = [titled(_seen(world, label, ARC_M), label) for label in world.labels]
+    tiles = [titled(_frame(world, label, ARC_M), label) for label in world.labels]
     rows = [beside(tiles[:2]), beside(tiles[2:])]
     write_jpeg(folder / "environments.jpg", below(rows), 720)
 
@@ -76,7 +76,7 @@ def draw_worlds(folder: Path, small: bool) -> None:
     for name, yaw_deg in ("left", 55), ("front", 0), ("right", -55):
         text += CAMERA.format(name, yaw_deg, width // 2, height)
     world = _world(text)
-    frame = _seen(world, "surrogate", ARC_M)
+    frame = _frame(world, "surrogate", ARC_M)
     views = world.scenario.rig().views
     cut = [frame.crop((c.start, 0, c.stop, height)) for _, c in views.values()]
     named = [titled(*pair) for pair in zip(cut, views, strict=True)]
@@ -86,7 +86,9 @@ def draw_worlds(folder: Path, small: bool) -> None:
     world = _world(room.replace("spp = 4", f"spp = {4 * spp}"))
     [cube] = world.fields
     cube.set_parameter("texture", random_texture(cube, "blobs", 4))
-    tiles = [titled(_seen(world, name, 0.4), name) for name in ("surrogate", "mitsuba")]
+    tiles = [
+        titled(_frame(world, name, 0.4), name) for name in ("surrogate", "mitsuba")
+    ]
     write_jpeg(folder / "room.jpg", beside(tiles), 800)
 
     lower, upper, faces = box_pictures(cube)
@@ -105,7 +107,7 @@ def _world(text: str) -> World:
     return build_world(scenario, scenario.build_policy())
 
 
-def _seen(world: World, label: str, arc_m: float) -> Image.Image:
+def _frame(world: World, label: str, arc_m: float) -> Image.Image:
     """Return the frame of an environment with the car on the route."""
     environment = world.open(label)
     frame = environment.reset(world.route, world.route.pose_at(arc_m), 0)

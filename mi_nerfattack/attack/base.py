@@ -74,8 +74,8 @@ def offset_gradients(
         gradient: with that by their poses among its parameters.
     """
     pairs = zip(sensor.objects, sensor.pose_keys, strict=True)
-    found = [posed.offset_gradient(gradient.parameters[key]) for posed, key in pairs]
-    return np.array(found).reshape(-1, 6)
+    rows = [posed.offset_gradient(gradient.parameters[key]) for posed, key in pairs]
+    return np.array(rows).reshape(-1, 6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +115,8 @@ class AbstractAttack(ABC):
         best_objective: least so far.
         best_mean_m: mean |e| of the same iteration, metres.
         best_offsets: (k, 6) object offsets of the same.
-        whole: False while an update is half done, when the state must not be kept.
+        is_consistent: False while an update is half done, when the state must not be
+            kept.
         one_level: whether objects are marched as one level while they are optimised.
     """
 
@@ -139,7 +140,7 @@ class AbstractAttack(ABC):
         self.best_objective: float = np.inf
         self.best_mean_m: float = 0.0
         self.best_offsets: np.ndarray = offsets_of(sensor.objects)
-        self.whole = True
+        self.is_consistent = True
 
     @property
     def iteration(self) -> int:
@@ -251,8 +252,8 @@ class AbstractAttack(ABC):
         loop = self.rollout.loop
         loop = replace(loop, sensor=sensor.drawing_as(loop.sensor))
         closed = replace(self.rollout, loop=loop, camera_path=None)
-        seen = closed.measure(self.initial)
-        return float(distances(self.route, seen).mean())
+        evaluation = closed.measure(self.initial)
+        return float(distances(self.route, evaluation).mean())
 
     @abstractmethod
     def tensors(self) -> dict[str, np.ndarray]:
@@ -312,10 +313,10 @@ def read_history(tensors: dict[str, np.ndarray]) -> list[IterationRecord]:
     if counts.shape != rows.shape[:1] or counts.sum() != len(costs):
         raise InputError(f"{len(rows)} iterations, costs of {len(counts)}")
     # The costs of all iterations are end to end: cut them where each iteration ends.
-    parts = np.split(costs, np.cumsum(counts)[:-1])
+    segments = np.split(costs, np.cumsum(counts)[:-1])
     return [
         IterationRecord(int(iteration), *numbers, costs=tuple(part.tolist()))
-        for (iteration, *numbers), part in zip(rows.tolist(), parts, strict=False)
+        for (iteration, *numbers), part in zip(rows.tolist(), segments, strict=False)
     ]
 
 
@@ -340,7 +341,7 @@ def best_so_far(
     return np.column_stack([frames, values[best], np.array(means_m)[best]])
 
 
-def distances(route: Route, seen: Evaluation) -> np.ndarray:
+def distances(route: Route, evaluation: Evaluation) -> np.ndarray:
     """Return the distances from the lane centre, metres, of all states of drives."""
-    states = seen.trajectory.states_numpy()[:, 1:]
+    states = evaluation.trajectory.states_numpy()[:, 1:]
     return np.abs(route.cross_track_numpy(states.reshape(-1, states.shape[2])))

@@ -128,11 +128,11 @@ class GradientAttack(AbstractAttack):
             rollout = self.plan.followed(self.rollout, self._objectives)
             gradient = rollout.gradient(evaluation, moved, on_step=on_step)
         values = self._values(gradient)
-        self.whole = False
+        self.is_consistent = False
         gain = self._update(values)
         self.history.append(record)
         self.predicted_gains.append(gain)
-        self.whole = True
+        self.is_consistent = True
         return record
 
     def _begin(self) -> None:
@@ -208,8 +208,8 @@ class GradientAttack(AbstractAttack):
         rows = super().rows()
         gains = zip(self.predicted_gains, self._gains.tolist(), strict=True)
         for k, (row, pair) in enumerate(zip(rows, gains, strict=True)):
-            told = pair if k >= self.plan.tried else (None, None)
-            row["predicted_gain"], row["gain"] = told
+            gain_pair = pair if k >= self.plan.tried else (None, None)
+            row["predicted_gain"], row["gain"] = gain_pair
         return rows
 
     @property
@@ -219,8 +219,8 @@ class GradientAttack(AbstractAttack):
         Of an attack that converged, their last fifth, which was to gain nothing, does
         not count.
         """
-        gains = self.predicted_gains, self._gains
-        return self.plan.least_gain(self._objectives, *gains)
+        predicted = self.predicted_gains
+        return self.plan.least_gain(self._objectives, predicted, self._gains)
 
     @property
     def _gains(self) -> np.ndarray:
@@ -376,23 +376,23 @@ class GradientAttack(AbstractAttack):
         self._depended = np.array(tensors["depended"], bool)
 
     def _record(
-        self, seen: Evaluation, colours: Parameters | None = None
+        self, evaluation: Evaluation, colours: Parameters | None = None
     ) -> IterationRecord:
         """Judge a drive; keep its parameters if they are the best.
 
         Args:
-            seen: the drive.
+            evaluation: the drive.
             colours: that it was driven with; the present ones by default.
         """
         colours = self._colours() if colours is None else colours
-        error = distances(self.route, seen)
-        mean, value = float(error.mean()), seen.value
+        error = distances(self.route, evaluation)
+        mean, value = float(error.mean()), evaluation.value
         value += self._penalty(colours)
         if value < self.best_objective:
             self._best = colours
             self.best_offsets = offsets_of(self.sensor.objects)
             self.best_objective, self.best_mean_m = value, mean
-        costs = tuple(map(float, seen.costs))
+        costs = tuple(map(float, evaluation.costs))
         return IterationRecord(self.iteration, value, mean, float(error.max()), costs)
 
 

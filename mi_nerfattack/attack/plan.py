@@ -235,11 +235,11 @@ class Plan:
             schedule, part = self._schedule(last), _part(objectives, last)
             settled = schedule.has_converged(part)
             ends.append((last, last + schedule.full(part), settled))
-        parts = []
+        ranges = []
         for start, end, settled in ends:
             cut = settled and has_settled(_part(objectives[:end], start))
-            parts.append(range(start, end - (end - start) // 5 * cut))
-        return parts
+            ranges.append(range(start, end - (end - start) // 5 * cut))
+        return ranges
 
     def least_gain(
         self,

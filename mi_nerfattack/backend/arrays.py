@@ -22,22 +22,22 @@ from drjit.opt import Adam
 from mi_nerfattack.errors import InputError
 
 
-def concat(parts: Sequence[Any], counts: Sequence[int]) -> Any:
+def concat(chunks: Sequence[Any], counts: Sequence[int]) -> Any:
     """Lay arrays, or dataclasses and lists of arrays, end to end.
 
     Args:
-        parts: all of the same structure. An array may have a single entry, which then
-            counts for its whole part. A leaf that is not an array is equal in all
-            parts.
-        counts: size of each part.
+        chunks: all of the same structure. An array may have a single entry, which then
+            counts for its whole chunk. A leaf that is not an array is equal in all
+            chunks.
+        counts: size of each chunk.
 
     Returns:
         evaluated arrays of the sum of the sizes.
     """
-    result, start = _empty(parts[0], sum(counts)), 0
-    for part, count in zip(parts, counts, strict=True):
-        put(result, part, dr.opaque(mi.UInt32, start) + dr.arange(mi.UInt32, count))
-        dr.eval(result)  # of parts of equal size it would make one kernel
+    result, start = _empty(chunks[0], sum(counts)), 0
+    for chunk, count in zip(chunks, counts, strict=True):
+        put(result, chunk, dr.opaque(mi.UInt32, start) + dr.arange(mi.UInt32, count))
+        dr.eval(result)  # of chunks of equal size it would make one kernel
         start += count
     return result
 
@@ -46,12 +46,12 @@ def split(array: Any, count: int) -> list[Any]:
     """Cut an array (n count,) into n of `count` entries, evaluated."""
     within = dr.arange(mi.UInt32, count)
     starts = range(0, dr.width(array), count)
-    parts = []
+    chunks = []
     for start in starts:
         place = dr.opaque(mi.UInt32, start) + within
-        parts.append(dr.gather(type(array), array, place))
-        dr.eval(parts[-1])  # see `concat`
-    return parts
+        chunks.append(dr.gather(type(array), array, place))
+        dr.eval(chunks[-1])  # see `concat`
+    return chunks
 
 
 def _empty(part: Any, size: int) -> Any:

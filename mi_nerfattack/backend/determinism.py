@@ -21,19 +21,19 @@ from mi_nerfattack.errors import SetupError
 
 
 @contextmanager
-def deterministic(wanted: bool = True) -> Iterator[None]:
+def deterministic(enabled: bool = True) -> Iterator[None]:
     """Let equal input give equal bits: kernels, BLAS and torch on one thread.
 
     What differs from run to run otherwise is the order in which threads add gradients
     up; torch also refuses operations without a deterministic implementation.
 
     Args:
-        wanted: whether; otherwise nothing is changed.
+        enabled: whether; otherwise nothing is changed.
 
     Raises:
         SetupError: the variant runs on a GPU, which sums in any order.
     """
-    if not wanted:
+    if not enabled:
         yield
         return
     if dr.backend_v(mi.Float) != dr.JitBackend.LLVM:

@@ -38,23 +38,23 @@ def raised_interrupts(end: Callable[[], None]) -> Iterator[None]:
         heard.set()
         raise KeyboardInterrupt
 
-    arrived, told = socket.socketpair()  # Python writes the number of each signal
-    told.setblocking(False)
-    watch = threading.Thread(target=_watch, args=(arrived, heard, end), daemon=True)
+    receiver, sender = socket.socketpair()  # Python writes the number of each signal
+    sender.setblocking(False)
+    watch = threading.Thread(target=_watch, args=(receiver, heard, end), daemon=True)
     watch.start()
     before = {signal.SIGTERM: signal.signal(signal.SIGTERM, interrupt)}
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not ignored
         before[signal.SIGINT] = signal.signal(signal.SIGINT, interrupt)
-    written = signal.set_wakeup_fd(told.fileno(), warn_on_full_buffer=False)
+    written = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
     try:
         yield
     finally:
         signal.set_wakeup_fd(written)
         for number, handler in before.items():
             signal.signal(number, handler)
-        told.close()
+        sender.close()
         watch.join()
-        arrived.close()
+        receiver.close()
 
 
 def _watch(

@@ -89,18 +89,18 @@ def check_version() -> tuple[int, int, int]:
     """
     from mi_nerfattack.errors import SetupError
 
-    found = version()
+    llvm_version = version()
     chosen = os.environ.get(VARIABLE)
-    if found is None:
+    if llvm_version is None:
         where = "no LLVM library found" if chosen is None else f"cannot load {chosen}"
         raise SetupError(f"{VARIABLE}: {where}; {_remedy()}")
-    if found[0] < MINIMUM:
-        name = ".".join(map(str, found))
+    if llvm_version[0] < MINIMUM:
+        name = ".".join(map(str, llvm_version))
         raise SetupError(
             f"{VARIABLE}: LLVM {name} is loaded, {MINIMUM} or newer is needed; "
             f"{_remedy()}"
         )
-    return found
+    return llvm_version
 
 
 def _remedy() -> str:
@@ -126,13 +126,13 @@ def _find_in_package() -> Path | None:
 
 
 def _find_in_system() -> Path | None:
-    found = [
+    libraries = [
         (_major(path), path)
         for folder in _system_folders()
         for path in folder.glob("libLLVM*")
         if _LIBRARY.match(path.name) and path.is_file()
     ]
-    usable = [item for item in found if item[0] >= MINIMUM_SYSTEM]
+    usable = [item for item in libraries if item[0] >= MINIMUM_SYSTEM]
     return max(usable)[1] if usable else None
 
 

@@ -45,8 +45,8 @@ def _own_source() -> str:
     places = {"": Path(mi_nerfattack.__path__[0])}
     for name in _ELSEWHERE:
         spec = importlib.util.find_spec(f"mi_nerfattack.{name}")
-        found = spec and spec.submodule_search_locations
-        places[name] = Path((found or [places[""] / name])[0])
+        locations = spec and spec.submodule_search_locations
+        places[name] = Path((locations or [places[""] / name])[0])
     return digest_code(places)
 
 
@@ -64,13 +64,13 @@ def digest_code(places: Mapping[str, Path]) -> str:
     """
     total = hashlib.sha256()
     for prefix, folder in places.items():
-        found = {path.relative_to(folder): path for path in folder.rglob("*.py")}
-        if not found:
+        paths = {path.relative_to(folder): path for path in folder.rglob("*.py")}
+        if not paths:
             raise SetupError(f"{folder}: has no Python files; install the package anew")
-        for name in sorted(found):
+        for name in sorted(paths):
             if prefix or name.parts[0] not in (*_INERT, *places):
-                about = f"{prefix}/{name.as_posix()}\n"
-                total.update(about.encode() + found[name].read_bytes())
+                entry = f"{prefix}/{name.as_posix()}\n"
+                total.update(entry.encode() + paths[name].read_bytes())
     return total.hexdigest()[:12]
 
 

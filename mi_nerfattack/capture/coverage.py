@@ -61,22 +61,22 @@ def nearest_points(
         from motion has outliers; 0 where there are fewer than 100.
     """
     shown = points_shown(cameras, camera_to_world, points)
-    found = np.zeros(len(cameras))
+    distances = np.zeros(len(cameras))
     for i in np.flatnonzero(shown.sum(1) >= _ENOUGH):
         away = np.linalg.norm(points[shown[i]] - camera_to_world[i, :3, 3], axis=1)
-        found[i] = np.percentile(away, _OUTLIERS_PERCENT)
-    return found
+        distances[i] = np.percentile(away, _OUTLIERS_PERCENT)
+    return distances
 
 
 def points_shown(
     cameras: Sequence[Camera], camera_to_world: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
     """Tell which points (m, 3) each picture has, (n, m)."""
-    found = []
+    shown = []
     for camera, pose in zip(cameras, camera_to_world, strict=True):
         local = (points - pose[:3, 3]) @ pose[:3, :3]
-        found.append(project(camera, local)[1])
-    return np.stack(found)
+        shown.append(project(camera, local)[1])
+    return np.stack(shown)
 
 
 def _gap(
@@ -86,12 +86,14 @@ def _gap(
     usable: np.ndarray,
     points: np.ndarray,
 ) -> float:
-    seen = np.flatnonzero(shown[view])
-    if not len(seen):
+    indices = np.flatnonzero(shown[view])
+    if not len(indices):
         return 180.0
-    seen = seen[:: -(-len(seen) // _POINTS)]
-    rays = eyes[:, None] - points[seen]
+    indices = indices[:: -(-len(indices) // _POINTS)]
+    rays = eyes[:, None] - points[indices]
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-    cosine = np.where(shown[:, seen] & usable[:, None], (rays * rays[view]).sum(2), -1)
+    cosine = np.where(
+        shown[:, indices] & usable[:, None], (rays * rays[view]).sum(2), -1
+    )
     cosine[view] = -1
     return float(np.median(np.degrees(np.arccos(np.clip(cosine.max(0), -1, 1)))))

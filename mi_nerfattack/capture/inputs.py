@@ -129,8 +129,8 @@ def _read_axial(
     stored = _at_pixels(reader(where), camera)
     axial = stored.astype(np.float64)
     axial *= _MILLIMETRE if stored.dtype.kind in "ui" else 1
-    seen = axial[(axial > 0) & (axial < _NOTHING_M)]
-    if seen.size and (middle := np.median(seen)) > _FAR_M:
+    surface_depths = axial[(axial > 0) & (axial < _NOTHING_M)]
+    if surface_depths.size and (middle := np.median(surface_depths)) > _FAR_M:
         raise InputError(
             f"{where}: half of the depths are beyond {middle:.0f} m; "
             "real numbers are metres here, and millimetres in nerfstudio by default: "
@@ -191,7 +191,7 @@ def _at_pixels(values: np.ndarray, camera: Camera) -> np.ndarray:
 def find_bounds(
     images: PosedImages,
     depth: np.ndarray | None = None,
-    given: Sequence[float] | None = None,
+    bounds: Sequence[float] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Choose the box of a field.
 
@@ -204,7 +204,7 @@ def find_bounds(
     Args:
         images: the posed images, perhaps with sparse points.
         depth: (n, height, width), metres along the ray, NaN where unknown; or None.
-        given: x0, y0, z0, x1, y1, z1, metres, or None.
+        bounds: x0, y0, z0, x1, y1, z1, metres, or None.
 
     Returns:
         lower and upper corner, (3,) each, metres.
@@ -213,16 +213,16 @@ def find_bounds(
         InputError: the given bounds are out of order, or the optical axes are
             parallel, so that no point is nearest to them.
     """
-    if given is not None:
-        lower, upper = np.array(given[:3], float), np.array(given[3:], float)
-        if not (np.isfinite(given).all() and (lower < upper).all()):
+    if bounds is not None:
+        lower, upper = np.array(bounds[:3], float), np.array(bounds[3:], float)
+        if not (np.isfinite(bounds).all() and (lower < upper).all()):
             raise InputError(
-                f"bounds: {list(given)}; must be x0 y0 z0 x1 y1 z1 with x0 < x1, ..."
+                f"bounds: {list(bounds)}; must be x0 y0 z0 x1 y1 z1 with x0 < x1, ..."
             )
         return lower, upper
-    seen = None if depth is None else _box_of_points(images, depth)
-    if seen is not None:
-        return seen
+    box = None if depth is None else _box_of_points(images, depth)
+    if box is not None:
+        return box
     if images.points is not None and len(images.points) > 0:
         return _box_of_sparse(images.points, images.camera_to_world[:, :3, 3])
     focus = _focus(images.camera_to_world)
@@ -236,10 +236,10 @@ def _box_of_points(
     """Return the box of the points of depth maps, None where there are none."""
     ends = []
     for eye, rays in depth_rays(images, depth, range(len(images))):
-        seen = rays[rays[..., 3] > 0].astype(np.float64)
-        if len(seen):
-            t = 1 / seen[:, 3:]
-            points = eye + t * seen[:, :3]
+        hits = rays[rays[..., 3] > 0].astype(np.float64)
+        if len(hits):
+            t = 1 / hits[:, 3:]
+            points = eye + t * hits[:, :3]
             ends.append((points.min(0), points.max(0), t.max()))
     if not ends:
         return None
@@ -290,7 +290,7 @@ def depth_rays(
     for index in indices:
         camera, pose = images.camera_of(index), images.camera_to_world[index]
         direction = generate_rays(camera, *pose_arrays(pose), 1)[1].numpy()
-        size = camera.height, camera.width
+        direction = direction.T.reshape(camera.height, camera.width, 3)
         inverse = np.where(np.isfinite(depth[index]), 1 / depth[index], 0)
-        rays = np.concatenate([direction.T.reshape(*size, 3), inverse[..., None]], 2)
+        rays = np.concatenate([direction, inverse[..., None]], 2)
         yield pose[:3, 3], rays.astype(np.float32)

@@ -18,7 +18,7 @@ from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import Camera
 
 SUFFIX = ".png"
-_WHOLE = 0.999  # share of a reduced pixel that has to count
+_LEAST_SHARE = 0.999  # share of a reduced pixel that has to count
 
 
 def read_mask(path: Path, width: int, height: int) -> np.ndarray:
@@ -76,7 +76,7 @@ def load_masks(
             full = read_mask(path, camera.width, camera.height).astype(np.float32)
             size = small.width, small.height
             shares = Image.fromarray(full).resize(size, Image.Resampling.BOX)
-            mask = np.asarray(shares) > _WHOLE
+            mask = np.asarray(shares) > _LEAST_SHARE
         if not mask.any():
             raise InputError(
                 f"{path}: no pixel of {small.width} x {small.height} px is white as a "
@@ -106,20 +106,22 @@ def stage_masks(
         masks.stat()
         is_folder = masks.is_dir()
         inside = list(masks.iterdir()) if is_folder else []
-    found = {name: masks for name in names}
+    paths = {name: masks for name in names}
     if is_folder:
-        given = {p.name for p in inside if p.suffix.lower() == SUFFIX}
-        found = {n: masks / (n + SUFFIX) for n in names if n + SUFFIX in given}
-        strays = sorted(given - {path.name for path in found.values()})
-        if strays or not found:
-            told = f"{strays[0]} belongs to no photograph" if strays else "has no mask"
+        file_names = {p.name for p in inside if p.suffix.lower() == SUFFIX}
+        paths = {n: masks / (n + SUFFIX) for n in names if n + SUFFIX in file_names}
+        strays = sorted(file_names - {path.name for path in paths.values()})
+        if strays or not paths:
+            problem = (
+                f"{strays[0]} belongs to no photograph" if strays else "has no mask"
+            )
             raise InputError(
-                f"{masks}: {told}; masks are PNGs with the whole name of their "
+                f"{masks}: {problem}; masks are PNGs with the whole name of their "
                 f"photograph before .png: {names[0]}{SUFFIX}"
             )
     for name in names:  # without a mask, COLMAP leaves the photograph out
         height, width = files.read_image(photographs / name).shape[:2]
         grey = np.full((height, width), 255, np.uint8)
-        if name in found:
-            grey[~read_mask(found[name], width, height)] = 0
+        if name in paths:
+            grey[~read_mask(paths[name], width, height)] = 0
         files.write_image(target / (name + SUFFIX), grey)

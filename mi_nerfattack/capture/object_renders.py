@@ -98,7 +98,7 @@ def render_asset(
         {"type": "scene", "light": light.emitter(), **mitsuba_shapes(mesh)},
         parallel=False,
     )
-    is_solid = all(part.is_solid for part in mesh.parts)
+    is_solid = all(part.is_solid for part in mesh.submeshes)
     # volpath alone does not count passing through a mask as a bounce
     kind = "path" if is_solid else "volpath"
     integrator = mi.load_dict({"type": kind, "max_depth": 2, "hide_emitters": True})

@@ -176,10 +176,10 @@ def pose_matrix(
 
 
 def _times(path: Path, rows: Sequence[Mapping[str, Any]]) -> np.ndarray | None:
-    given = [row.get("time_s") for row in rows]
-    if all(value is None for value in given):
+    times = [row.get("time_s") for row in rows]
+    if all(value is None for value in times):
         return None
-    values = [_number(f"{path}: row {i}", "time_s", v) for i, v in enumerate(given)]
+    values = [_number(f"{path}: row {i}", "time_s", v) for i, v in enumerate(times)]
     return np.array(values)
 
 

@@ -172,8 +172,8 @@ def load_images(
 
 def differing(cameras: Iterable[Camera]) -> tuple[Camera, ...]:
     """Return the cameras, or nothing if they are all equal."""
-    found = tuple(cameras)
-    return found if len(set(found)) > 1 else ()
+    lenses = tuple(cameras)
+    return lenses if len(set(lenses)) > 1 else ()
 
 
 def _reduced(camera: Camera, long_edge_px: int | None) -> Camera:

@@ -103,8 +103,10 @@ def drive_poses(
     poses = []
     for i in range(n):
         state = _scattered(routes[i % len(routes)], along[i], lateral[i], heading[i])
-        here = replace(mount, height_m=float(height[i]), pitch_deg=float(pitch[i]))
-        poses.append(mount_matrix(state, here)[0])
+        drawn_mount = replace(
+            mount, height_m=float(height[i]), pitch_deg=float(pitch[i])
+        )
+        poses.append(mount_matrix(state, drawn_mount)[0])
     return np.stack(poses)
 
 
@@ -240,9 +242,9 @@ def _write_views(
     n, renderer = len(poses), ViewRenderer(scene, camera)
     names = [f"images/{i:04d}.png" for i in range(n)]
     depth = np.empty((n, camera.height, camera.width), np.float32)
-    kept = files.make_folder(root / _VIEWS)
+    folder = files.make_folder(root / _VIEWS)
     for i, view_seed in enumerate(view_seeds(drawn["seed"], n)):
-        file = kept / f"{i:04d}.safetensors"
+        file = folder / f"{i:04d}.safetensors"
         unit = Unit(file, {**identity, "view": str(i)}, Record, _REMEDY)
         image, depth[i] = _view(unit, renderer, poses[i], drawn["spp"], view_seed)
         files.write_image(root / names[i], image)
@@ -279,11 +281,11 @@ def _view(
 
 
 def _identity(choices: dict[str, Any], scene: Path, routes: Path) -> dict[str, str]:
-    found = {"format": _FORMAT, **versions(), **flatten("capture", choices)}
+    identity = {"format": _FORMAT, **versions(), **flatten("capture", choices)}
     for name, file in {"scene": scene, "routes": routes, **named_files(scene)}.items():
         entry = {"file": file.name, "sha256": files.sha256(file)}
-        found[f"file.{name}"] = json.dumps(entry)
-    return found
+        identity[f"file.{name}"] = json.dumps(entry)
+    return identity
 
 
 def is_begun(folder: Path) -> bool:
@@ -297,6 +299,6 @@ def is_begun(folder: Path) -> bool:
 
 
 def _made_of(path: Path) -> dict[str, str]:
-    found = files.read_json(path)
-    made = found.get(_IDENTITY) if isinstance(found, dict) else None
+    document = files.read_json(path)
+    made = document.get(_IDENTITY) if isinstance(document, dict) else None
     return {**made} if isinstance(made, dict) else {}

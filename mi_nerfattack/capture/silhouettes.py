@@ -30,11 +30,11 @@ def check_alpha(images: PosedImages, source: str) -> None:
         )
     alpha = [image[..., 3] for image in images.images]
     least, most = min(a.min() for a in alpha), max(a.max() for a in alpha)
-    for name, found, what in (
+    for name, is_uniform, what in (
         ("1", least > 255 * (1 - _ALPHA), "nothing tells object and background"),
         ("0", most < 255 * _ALPHA, "no object is seen"),
     ):
-        if found:
+        if is_uniform:
             raise InputError(
                 f"{source}: alpha is {name} in all images, so that {what}; render "
                 "the object on a transparent background"
@@ -68,10 +68,10 @@ def silhouette_bounds(images: PosedImages) -> tuple[np.ndarray, np.ndarray]:
                 "images: no point lies inside of all silhouettes; check the poses and "
                 "the alpha, or give the object's box (--bounds x0 y0 z0 x1 y1 z1)"
             )
-        found = np.stack(np.nonzero(inside))
+        indices = np.stack(np.nonzero(inside))
         cell = (upper - lower) / cells
-        low = np.maximum(lower, lower + (found.min(1) - 1) * cell)
-        high = np.minimum(upper, lower + (found.max(1) + 2) * cell)
+        low = np.maximum(lower, lower + (indices.min(1) - 1) * cell)
+        high = np.minimum(upper, lower + (indices.max(1) + 2) * cell)
         shrunk = np.any(high - low < 0.85 * (upper - lower))
         lower, upper = low, high
         if cells == _FINE:
@@ -114,19 +114,19 @@ def _inside(
     points = lower + grid.reshape(-1, 3) * (upper - lower)
     radius = 0.5 * float(np.linalg.norm((upper - lower) / cells))
     alive = np.arange(len(points))
-    seen = np.zeros(len(points), int)
+    view_counts = np.zeros(len(points), int)
     for index, (mask, factor) in zip(chosen, silhouettes, strict=True):
         camera = images.camera_of(index)
         pose = images.camera_to_world[index]
         local = (points[alive] - pose[:3, 3]) @ pose[:3, :3]
         image, valid = project(camera, local)
-        seen[alive[valid]] += 1
+        view_counts[alive[valid]] += 1
         pixels = max(camera.fx, camera.fy) / factor * radius / local[valid, 2]
         column, row = image[valid].T.astype(int) // factor
         outside = np.zeros(len(alive), bool)
         outside[valid] = ~_touches(mask, row, column, pixels)
         alive = alive[~outside]
-    alive = alive[seen[alive] >= _SEEN_BY * len(chosen)]
+    alive = alive[view_counts[alive] >= _SEEN_BY * len(chosen)]
     inside = np.zeros(len(points), bool)
     inside[alive] = True
     return inside.reshape((cells,) * 3)

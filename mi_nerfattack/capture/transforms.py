@@ -80,8 +80,8 @@ def _nothing_found(folder: Path) -> str:
 
 
 def _json_in(folder: Path) -> Path | None:
-    found = [folder / name for name in FILE_NAMES if (folder / name).is_file()]
-    return found[0] if found else None
+    paths = [folder / name for name in FILE_NAMES if (folder / name).is_file()]
+    return paths[0] if paths else None
 
 
 def read_transforms(
@@ -105,8 +105,8 @@ def read_transforms(
     """
     source = find_transforms(Path(path))
     table, frames = read_table(source)
-    found, missing = _find_images(source, frames, skip_missing)
-    used, paths = {i: frames[i] for i in found}, list(found.values())
+    image_paths, missing = _find_images(source, frames, skip_missing)
+    used, paths = {i: frames[i] for i in image_paths}, list(image_paths.values())
     poses = read_frames(source, used)
     first = files.read_image(paths[0])
     cameras = read_cameras(source, table, used, first.shape)
@@ -139,21 +139,21 @@ def _find_images(
     source: Path, frames: Sequence[Mapping[str, Any]], skip_missing: bool
 ) -> tuple[dict[int, Path], list[str]]:
     """Return image files by their frames, and the names of those that are missing."""
-    found: dict[int, Path] = {}
+    image_paths: dict[int, Path] = {}
     missing: list[str] = []
     for i, frame in enumerate(frames):
         image = _find_image(source, i, frame)
         if image is None:
             missing.append(frame["file_path"])
         else:
-            found[i] = image
-    if missing and (not skip_missing or not found):
+            image_paths[i] = image
+    if missing and (not skip_missing or not image_paths):
         raise InputError(
             f"{source}: {len(missing)} of {len(frames)} frames have no image, first "
             f"{missing[0]!r}; restore the files or leave these frames out "
             "(--skip-missing, or skip_missing=True)"
         )
-    return found, missing
+    return image_paths, missing
 
 
 def named_path(source: Path, field: str, name: Any) -> Path:
@@ -202,19 +202,21 @@ def _turned_points(
     `applied_transform`. The points are taken of which the images show more, and of a
     tie those of the file, which today's version has turned.
     """
-    given = table.get("applied_transform")
-    if given is None:
+    transform = table.get("applied_transform")
+    if transform is None:
         return points
     try:
-        matrix = np.array(given, np.float64)[:3]
+        matrix = np.array(transform, np.float64)[:3]
     except (TypeError, ValueError, IndexError):
         matrix = np.zeros(0)
     if matrix.shape != (3, 4) or not np.abs(matrix).max() < np.finfo(np.float32).max:
-        raise InputError(f"{source}: applied_transform: {given!r}; needs 3 x 4 numbers")
+        raise InputError(
+            f"{source}: applied_transform: {transform!r}; needs 3 x 4 numbers"
+        )
     with np.errstate(all="ignore"):
-        found = [points, points @ matrix[:, :3].T + matrix[:, 3]]
-        counts = [points_shown(cameras, poses, each).sum() for each in found]
-    return found[int(counts[1] > counts[0])]
+        candidates = [points, points @ matrix[:, :3].T + matrix[:, 3]]
+        counts = [points_shown(cameras, poses, each).sum() for each in candidates]
+    return candidates[int(counts[1] > counts[0])]
 
 
 def _own_points(source: Path, where: Path) -> np.ndarray:
@@ -307,10 +309,10 @@ def find_transforms(path: Path) -> Path:
     with files.reported(path):
         if not path.is_dir():
             return path
-        found = _json_in(path)
-    if found is None:
+        json_path = _json_in(path)
+    if json_path is None:
         raise InputError(f"{path}: has neither {FILE_NAMES[0]} nor {FILE_NAMES[1]}")
-    return found
+    return json_path
 
 
 def _find_image(source: Path, index: int, frame: Any) -> Path | None:

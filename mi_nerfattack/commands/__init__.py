@@ -71,11 +71,11 @@ class Group:
     """Commands that belong together, called ``GROUP COMMAND``.
 
     Attributes:
-        about: a sentence for the help.
+        description: a sentence for the help.
         commands: by name.
     """
 
-    about: str
+    description: str
     commands: Mapping[str, type[Command]]
 
 

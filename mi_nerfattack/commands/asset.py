@@ -276,9 +276,9 @@ class AssetFlat:
         if self.picture is not None:
             picture = files.read_image(self.picture)[..., :3]
         save_field(self.output, flat.field(picture))
-        told = (
+        message = (
             f"Wrote {self.output}: {self.kind} of {self.width_m:g} x {self.height_m:g} "
             f"m, {flat.pixels} pixels along each edge"
         )
         figures = {"kind": self.kind, "pixels": flat.pixels}
-        return Result({"output": str(self.output), **figures}, lambda: print(told))
+        return Result({"output": str(self.output), **figures}, lambda: print(message))

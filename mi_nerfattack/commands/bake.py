@@ -81,9 +81,11 @@ class Bake:
             baked = bake(scene, routes, camera, mount, options, plan, counter)
             seconds = time.perf_counter() - started
             save_field(output, baked)
-            pair = scene, PosedField(baked, scene.pose)
+            posed = PosedField(baked, scene.pose)
             score = bars.counter("comparing", "view ")
-            views = score_bake(*pair, routes, camera, mount, progress=score)
+            views = score_bake(
+                scene, posed, routes, camera=camera, mount=mount, progress=score
+            )
         facts = {
             "field": file.name,
             "bricks": len(plan.subdivisions),
@@ -93,8 +95,8 @@ class Bake:
         }
         title = f"Bake of {file.name}"
         page = write_bake_report(report_folder(output), views, facts, title)
-        told = f"{bake_verdict(views)}\nWrote {output} and {page}."
-        return Result(facts | bake_summary(views), lambda: print(told))
+        message = f"{bake_verdict(views)}\nWrote {output} and {page}."
+        return Result(facts | bake_summary(views), lambda: print(message))
 
     def _files(self, scenario: Scenario) -> tuple[Path, Path]:
         """Return field and output; refuse what would fail after the bake."""

@@ -76,24 +76,26 @@ class Calibrate:
             before = read_calibration(self.calibration)
         self._check(before)
         wheelbase_m = self.wheelbase_m or before.wheelbase_m or SMALL_CAR.wheelbase
-        kept = self.output.with_name(f"{self.output.name}.arcs.json")
-        arcs = read_arcs(kept)
+        arcs_path = self.output.with_name(f"{self.output.name}.arcs.json")
+        arcs = read_arcs(arcs_path)
         if arcs:
-            print(f"{kept} has {', '.join(arcs)}; remove it to drive these again.")
+            print(f"{arcs_path} has {', '.join(arcs)}; remove it to drive these again.")
         if arcs.keys() < DRIVES.keys():
-            self._drive(before, arcs, kept)
+            self._drive(before, arcs, arcs_path)
         try:
-            found, away_rad, spread = fit_arcs(list(arcs.values()), wheelbase_m, before)
+            calibration, away_rad, spread = fit_arcs(
+                list(arcs.values()), wheelbase_m, before
+            )
         except InputError as error:
             raise InputError(
-                f"{error}; {kept} has what was measured: take out what is wrong, and "
-                "call this again"
+                f"{error}; {arcs_path} has what was measured: take out what is wrong, "
+                "and call this again"
             ) from error
-        write_calibration(self.output, found)
-        kept.unlink()
+        write_calibration(self.output, calibration)
+        arcs_path.unlink()
         document = {
             "output": str(self.output),
-            "calibration": found.model_dump(mode="json"),
+            "calibration": calibration.model_dump(mode="json"),
             "before": before.model_dump(mode="json"),
             "length_spread": float(spread),
             "steering_away_rad": float(away_rad),
@@ -101,7 +103,10 @@ class Calibrate:
 
         def show() -> None:
             for name in ("erpm_per_ms", "servo_per_rad", "servo_centre"):
-                print(f"{name} = {getattr(found, name)} (was {getattr(before, name)})")
+                print(
+                    f"{name} = {getattr(calibration, name)} "
+                    f"(was {getattr(before, name)})"
+                )
             print(
                 f"Lengths agree to {spread:.1%}, steering angles to "
                 f"{math.degrees(away_rad):.1f} degrees. Written to {self.output}."
@@ -109,7 +114,9 @@ class Calibrate:
 
         return Result(document, show)
 
-    def _drive(self, before: Calibration, arcs: dict[Drive, Arc], kept: Path) -> None:
+    def _drive(
+        self, before: Calibration, arcs: dict[Drive, Arc], arcs_path: Path
+    ) -> None:
         """Arm, and add the drives that are missing; each is kept at once."""
         from mi_nerfattack.car.drive.safety.enable import (
             JoystickEnable,
@@ -136,7 +143,7 @@ class Calibrate:
                 if name not in arcs:
                     angle = sign * self.steering_rad
                     arcs[name] = self._measure(motor, pad, name, angle)
-                    write_arcs(kept, arcs)
+                    write_arcs(arcs_path, arcs)
 
     def _check(self, before: Calibration) -> None:
         from mi_nerfattack.errors import InputError
@@ -182,13 +189,13 @@ class Calibrate:
             )
             wait_for_press(pad, time.sleep, say)
             try:
-                driven = drive_arc(
+                servo, steps = drive_arc(
                     motor, command, self.distance_m, lambda: check_held(pad)
                 )
             except ReleasedError as error:
                 print(f"Braked: {error}. Once more.")
             else:
-                return _ask_for_arc(*driven)
+                return _ask_for_arc(servo, steps)
 
 
 def _ask_for_arc(servo: float, steps: int) -> Arc:
@@ -215,10 +222,10 @@ def _ask_for_arc(servo: float, steps: int) -> Arc:
 
 def _ask_number(question: str) -> float:
     while True:
-        given = ask(question)
+        answer = ask(question)
         try:
-            if math.isfinite(value := float(given.replace(",", "."))):
+            if math.isfinite(value := float(answer.replace(",", "."))):
                 return value
         except ValueError:
             pass
-        print(f"{given!r} is not a number.")
+        print(f"{answer!r} is not a number.")

@@ -129,8 +129,8 @@ class CaptureScene(_Capture):
         routes_picture(picture, self.source, routes, camera, mount)
         show(1, 1)
         bars.say(f"{picture}: scene, routes and lanes from above; look at it first")
-        told = f"Wrote {self.views} views to {path.parent}"
-        return path, {"views": self.views}, lambda: print(told)
+        message = f"Wrote {self.views} views to {path.parent}"
+        return path, {"views": self.views}, lambda: print(message)
 
 
 @dataclass(frozen=True)
@@ -177,8 +177,8 @@ class _Estimate(_Capture):
 
         result = self._estimate(self._options(), progress)
         picture = result.path.with_name("cameras.png")
-        write_cameras_above(picture, result.found, set(retake(result.qualities)))
-        table = quality_table(result.found, result.qualities, asdict(result.scale))
+        write_cameras_above(picture, result.structure, set(retake(result.qualities)))
+        table = quality_table(result.structure, result.qualities, asdict(result.scale))
         document = table | {"farthest": result.farthest, "distance": result.distance}
         return result.path, document, lambda: _tell(result, picture)
 

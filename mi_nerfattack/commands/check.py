@@ -78,9 +78,9 @@ class Check:
         show("drawing", 1, 1, "")
         check.price()
         document = {**check.document(), "picture": drawn and str(drawn)}
-        told = checks.sentences(check, str(self.file), drawn, self.settings)
+        lines = checks.sentences(check, str(self.file), drawn, self.settings)
         code = int(bool(check.refused))
-        return Result(document, lambda: print(*told, sep="\n"), code)
+        return Result(document, lambda: print(*lines, sep="\n"), code)
 
     def _grid(self, show: OnProgress) -> Result:
         from mi_nerfattack.commands.shared.cells import cells_at_a_time
@@ -93,9 +93,9 @@ class Check:
         forecast = Forecast(cells, self.output and self.output.resolve(), show)
         forecast.run(not self.no_drives)
         document = forecast.document()
-        told = sentences(document, cells_at_a_time(self.workers, cores=1))
+        lines = sentences(document, cells_at_a_time(self.workers, cores=1))
         code = int(any(document["refused"].values()))
-        return Result(document, lambda: print(*told, sep="\n"), code)
+        return Result(document, lambda: print(*lines, sep="\n"), code)
 
 
 def _shown(bars: StageBars) -> OnProgress:

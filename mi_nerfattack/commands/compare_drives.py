@@ -59,13 +59,13 @@ class CompareDrives:
             raise InputError(f"-o: {self.output}; holds a run, give another folder")
         variant.ensure()
         criteria = None if self.criteria is None else read_criteria(self.criteria)
-        (found,) = read_found([self.run_folder])
-        course = Course.of(found)
+        (attack,) = read_found([self.run_folder])
+        course = Course.of(attack)
         cases = ("no_object", "own", "random", "attack")
         recordings = {case: getattr(self, case) for case in cases}
         drives = read_all(recordings, course, McapTopics.parse(self.topics))
-        of_run = read_drives(found.folder / DRIVES)
-        document = real_document(found, course, of_run, drives, criteria)
+        of_run = read_drives(attack.folder / DRIVES)
+        document = real_document(attack, course, of_run, drives, criteria)
         real = [item.drive for item in drives]
         files.make_folder(self.output)
         files.write_json(self.output / "metrics.json", document)
@@ -74,11 +74,11 @@ class CompareDrives:
         if real:
             path = self.output / "overhead.png"
             overhead(path, drawn, course.route, [], lane.wheel_m)
-        told = [] if criteria is None else [*sentences(criteria, document["test"])]
-        told.append(f"Written: {self.output.resolve()}")
+        lines = [] if criteria is None else [*sentences(criteria, document["test"])]
+        lines.append(f"Written: {self.output.resolve()}")
 
         def show() -> None:
             console().print(metrics_table(document))
-            print(*told, sep="\n")
+            print(*lines, sep="\n")
 
         return Result(document, show)

@@ -62,13 +62,13 @@ class DriveCommand:
         """Read, open, state, arm, drive and sum up."""
         from mi_nerfattack.car.drive.config import read_config
 
-        given = {
+        options = {
             "policy": self.policy,
             "log": None if self.output is None else str(self.output),
             "simulated": self.simulated or None,
             "on_block": self.on_block or None,
         }
-        config = read_config(self.config, given, self.settings)
+        config = read_config(self.config, options, self.settings)
         config, trained = self._trained(config)
         config.check()
         route = config.read_route()
@@ -79,8 +79,8 @@ class DriveCommand:
             if self.dry_run:
                 return _dry_run(rig, settings)
             stop, loop, written = _drive(rig, config, settings)
-        found = loop.measures.figures(route)
-        figures = None if found is None else dataclasses.asdict(found)
+        measured = loop.measures.figures(route)
+        figures = None if measured is None else dataclasses.asdict(measured)
         document = {
             "end": stop.cause.value,
             "message": stop.message,
@@ -108,8 +108,8 @@ class DriveCommand:
             raise InputError(
                 f"--policy: none; give a file, {EXPERT}, or http://HOST:PORT"
             )
-        is_here = name != EXPERT and not name.startswith(SCHEMES)
-        file = PolicyFile.read(name) if is_here else None
+        is_local = name != EXPERT and not name.startswith(SCHEMES)
+        file = PolicyFile.read(name) if is_local else None
         rig = file and file.rig
         if config.camera_file is not None:
             rig = read_camera(config.camera_file)
@@ -217,11 +217,11 @@ def _drive(
     from mi_nerfattack.car.drive.loop import DriveLoop
 
     path = config.log_path(datetime.now())
-    about = {key: str(value) for key, value in config.model_dump().items()}
-    about["version"] = mi_nerfattack.__version__
+    metadata = {key: str(value) for key, value in config.model_dump().items()}
+    metadata["version"] = mi_nerfattack.__version__
     devices, clock = rig.devices, rig.clock
     camera = devices.camera.camera
-    log = DriveLog(path, camera, clock, time.time_ns(), about)
+    log = DriveLog(path, camera, clock, time.time_ns(), metadata)
     say(f"Log        {path}")
     loop = DriveLoop(devices, settings, log, rig.rounds, clock, rig.sleep, say)
     with closing(log):
@@ -239,12 +239,12 @@ def _drive(
             if not loop.measures.rows:
                 log.discard()
                 say(f"{path}: removed, for no command was sent")
-    about_log = {"log": None, "messages": {}}
+    log_record = {"log": None, "messages": {}}
     if loop.measures.rows:
-        about_log = {"log": str(path), "messages": dict(log.counts)}
+        log_record = {"log": str(path), "messages": dict(log.counts)}
         written = ", ".join(f"{n} {topic}" for topic, n in log.counts.items())
         say(f"{path}: {written}")
-    return stop, loop, about_log
+    return stop, loop, log_record
 
 
 def _arm(rig: Rig) -> None:
@@ -303,26 +303,26 @@ def _dry_run(rig: Rig, settings: DriveSettings) -> Result:
         "motor": motor,
         "policy": decision,
     }
-    found, held = dict.fromkeys(asks, ""), set()
+    problems, held = dict.fromkeys(asks, ""), set()
     say("Hold the enable button once within five seconds, and let it go.")
     while rig.clock() < end:
         held.add(devices.enable.is_held())
         for name, ask in asks.items():
             try:
                 ask()
-                found[name] = ""
+                problems[name] = ""
             except Stop as stop:
-                found[name] = str(stop)
+                problems[name] = str(stop)
         rig.sleep(settings.poll_s)
-    how = "always" if True in held else "never"
-    ill = f"it was {how} held; is it the right button?"
-    found["enable"] = "" if len(held) == 2 else ill
-    told = [f"{name:10} {problem or 'ready'}" for name, problem in found.items()]
-    document = {name: problem or None for name, problem in found.items()}
+    frequency = "always" if True in held else "never"
+    ill = f"it was {frequency} held; is it the right button?"
+    problems["enable"] = "" if len(held) == 2 else ill
+    lines = [f"{name:10} {problem or 'ready'}" for name, problem in problems.items()]
+    document = {name: problem or None for name, problem in problems.items()}
     return Result(
         {"refused": document},
-        lambda: print(*told, sep="\n"),
-        1 if any(found.values()) else 0,
+        lambda: print(*lines, sep="\n"),
+        1 if any(problems.values()) else 0,
     )
 
 

@@ -109,33 +109,39 @@ class Evaluate:
             if any(self.objects) and not work.place.objects:
                 town = "a town its --scene, " * (self.where.server is not None)
                 bars.say(f"no drives past objects: {town}a scene its --object FILE")
-            found = run_evaluation(work, workers, bars.counter("driving", "step "))
+            evaluation = run_evaluation(work, workers, bars.counter("driving", "step "))
         if self.output is not None:
-            files.write_json(self.output, found.card)
+            files.write_json(self.output, evaluation.card)
         if self.page is not None:
-            self._write_page(self.page, work, record, found, time.monotonic() - start)
-        return Result(found.card, lambda: console().print(card_table(found.card)))
+            self._write_page(
+                self.page, work, record, evaluation, time.monotonic() - start
+            )
+        return Result(
+            evaluation.card, lambda: console().print(card_table(evaluation.card))
+        )
 
     def _write_page(
         self,
         folder: Path,
         work: EvaluateDrives,
         record: TrainingRecord | None,
-        found: Evaluation,
+        evaluation: Evaluation,
         wall_s: float,
     ) -> None:
         from mi_nerfattack.report.pages.policy import write_policy_page
 
-        about = {
+        description = {
             **work.describe(),
             "command": command_line("evaluate", self),
             "wall_s": wall_s,
             "seconds_a_drive": {
                 f"{environment}, {case}": seconds
-                for (environment, case), seconds in found.seconds.items()
+                for (environment, case), seconds in evaluation.seconds.items()
             },
         }
-        path = write_policy_page(folder, about, record, found.card, found.drives)
+        path = write_policy_page(
+            folder, description, record, evaluation.card, evaluation.drives
+        )
         print(f"{path}: written", file=sys.stderr)
 
     def _work(self) -> EvaluateDrives:

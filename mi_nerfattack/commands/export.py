@@ -64,8 +64,8 @@ class ExportMesh:
             mesh = painted_mesh(grid, placement.mesh(self.mesh))
         write_glb(output, mesh)
         counts = {"triangles": len(mesh.faces), "vertices": len(mesh.vertices)}
-        told = "Wrote {}: {} triangles, {} vertices".format(output, *counts.values())
-        return Result({"output": str(output), **counts}, lambda: print(told))
+        message = "Wrote {}: {} triangles, {} vertices".format(output, *counts.values())
+        return Result({"output": str(output), **counts}, lambda: print(message))
 
 
 @dataclass(frozen=True)
@@ -96,12 +96,12 @@ class ExportFaces:
         write_faces(output, faces)
         size_m = (faces.upper - faces.lower).tolist()
         edges = " x ".join(f"{edge:.3f}" for edge in size_m)
-        told = (
+        message = (
             f"Wrote {output}: 6 pictures of a box of {edges} m, "
             f"{faces.pixels_per_m:.0f} pixels a metre"
         )
         figures = {"size_m": size_m, "pixels_per_m": float(faces.pixels_per_m)}
-        return Result({"output": str(output), **figures}, lambda: print(told))
+        return Result({"output": str(output), **figures}, lambda: print(message))
 
 
 @dataclass(frozen=True)
@@ -146,10 +146,10 @@ class ExportPrint:
         size = " x ".join(f"{edge:.1f}" for edge in edges)
         pages = "page" if count == 1 else "pages"
         what = "net" if box.sheet is None else "sheet"
-        told = f"Wrote {path}: {what} of {box.name}, {size} mm, {count} {pages}"
+        message = f"Wrote {path}: {what} of {box.name}, {size} mm, {count} {pages}"
         figures = {"edges_mm": edges.tolist(), "pages": count}
         document = {"output": str(path), "box": box.name, **figures}
-        return Result(document, lambda: print(told))
+        return Result(document, lambda: print(message))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,10 +184,10 @@ class ExportScreen(ScreenOptions):
         if path.suffix.lower() == ".png":
             files.write_image(path, image)
         else:
-            about = f"{box.name}, {face}, run {box.run}, digest {box.digest[:16]}"
-            files.write_text(path, screen_page(image, about))
+            caption = f"{box.name}, {face}, run {box.run}, digest {box.digest[:16]}"
+            files.write_text(path, screen_page(image, caption))
         dpi = float(MM * screen.px_per_mm[0])
-        told = (
+        message = (
             f"Wrote {path}: {face} of {box.name}, {size[0]:.1f} x {size[1]:.1f} mm "
             f"on {self.pixels} pixels, {dpi:.1f} an inch"
         )
@@ -198,7 +198,7 @@ class ExportScreen(ScreenOptions):
             "size_mm": [*map(float, size)],
             "pixels_per_inch": dpi,
         }
-        return Result(document, lambda: print(told))
+        return Result(document, lambda: print(message))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,13 +234,15 @@ class ExportRoutes:
             town_map = api.Map(self.map.stem, files.read_text(self.map))
         except RuntimeError as error:
             raise InputError(f"{self.map}: not an OpenDRIVE map ({error})") from error
-        found = town_routes(
+        routes = town_routes(
             self.routes_xml, town_map, api, self.routes, speed_ms=self.speed_ms
         )
-        files.write_json(self.output, {route.name: route.document() for route in found})
-        told = f"Wrote {self.output}: {len(found)} routes of {self.map.stem}"
-        document = {"output": str(self.output), "routes": [r.name for r in found]}
-        return Result(document, lambda: print(told))
+        files.write_json(
+            self.output, {route.name: route.document() for route in routes}
+        )
+        message = f"Wrote {self.output}: {len(routes)} routes of {self.map.stem}"
+        document = {"output": str(self.output), "routes": [r.name for r in routes]}
+        return Result(document, lambda: print(message))
 
 
 @dataclass(frozen=True)
@@ -266,5 +268,7 @@ class ExportOpenscenario:
         variant.ensure()
         written = write_openscenario(self.run_folder, self.output)
         names = [path.name for path in written]
-        told = f"Wrote {self.output}: {', '.join(names)}"
-        return Result({"output": str(self.output), "files": names}, lambda: print(told))
+        message = f"Wrote {self.output}: {', '.join(names)}"
+        return Result(
+            {"output": str(self.output), "files": names}, lambda: print(message)
+        )

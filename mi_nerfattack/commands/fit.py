@@ -83,8 +83,8 @@ class Fit:
 
         base = NGPLayout.small() if self.network == "small" else NGPLayout()
         names = ("levels", "log2_table", "max_resolution")
-        given = {name: getattr(self, name) for name in names}
-        return replace(base, **{k: v for k, v in given.items() if v is not None})
+        sizes = {name: getattr(self, name) for name in names}
+        return replace(base, **{k: v for k, v in sizes.items() if v is not None})
 
     def _options(self, has_depth: bool) -> FitOptions:
         from mi_nerfattack.fit.loss import LossWeights
@@ -134,7 +134,7 @@ class Fit:
         depth = read_depth(self.folder, images)
         lower, upper = find_bounds(images, depth, self.bounds)
         with StageBars() as bars:
-            for line in _told_before(images):
+            for line in _gap_warnings(images):
                 bars.say(line)
             result = fit_ngp(
                 images,
@@ -158,7 +158,7 @@ class Fit:
         )
 
 
-def _told_before(images: PosedImages) -> Iterator[str]:
+def _gap_warnings(images: PosedImages) -> Iterator[str]:
     """Say what speaks against a fit before hours are spent on it."""
     import numpy as np
 

@@ -73,8 +73,8 @@ class OverlayCommand:
                 bars.say(f"{self.recording}: {remark}")
             overlay = Overlay(box, recording.camera, keyed=not self.paste)
             times = recording.track.times
-            told = bars.counter("overlaying", "frame ")
-            frames = self._frames(recording, overlay, told)
+            on_frame = bars.counter("overlaying", "frame ")
+            frames = self._frames(recording, overlay, on_frame)
             if is_video:
                 steps = np.diff(times) if len(times) > 1 else views.period
                 fps = 1 / float(np.median(steps))
@@ -83,9 +83,9 @@ class OverlayCommand:
             else:
                 for index, frame in enumerate(frames):
                     files.write_image(self.output / f"{index:05d}.png", frame)
-        told = f"Wrote {self.output}: {len(times)} frames with {box.name}"
+        message = f"Wrote {self.output}: {len(times)} frames with {box.name}"
         figures = {"frames": len(times), "object": box.name}
-        return Result({"output": str(self.output), **figures}, lambda: print(told))
+        return Result({"output": str(self.output), **figures}, lambda: print(message))
 
     def _check_output(self) -> bool:
         """Refuse what would replace anything recorded; return whether it is a video."""

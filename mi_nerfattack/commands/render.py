@@ -195,10 +195,10 @@ class RenderPath(_Render):
         count, written = len(shot.camera_to_world), 0
         with StageBars() as bars:
 
-            def show(done: int, total: int, kept: bool) -> None:
+            def show(done: int, total: int, resumed: bool) -> None:
                 nonlocal written
                 written = done
-                bars.show("rendering", done, total, f"{done}/{total}", kept)
+                bars.show("rendering", done, total, f"{done}/{total}", resumed)
 
             try:
                 if is_video:
@@ -214,12 +214,12 @@ class RenderPath(_Render):
                     )
                 raise
         width, height = shot.renderer.size_px
-        told = [f"Wrote {self.output}: {count} frames, {size[0]} x {size[1]} px"]
+        lines = [f"Wrote {self.output}: {count} frames, {size[0]} x {size[1]} px"]
         if size != (width, height):
-            told.append(
+            lines.append(
                 f"  the frames have {width} x {height} px; the last column or row is "
                 "repeated, since H.264 (yuv420p) needs even sizes"
             )
         figures = {"frames": count, "size_px": [*size]}
         document = {"output": str(self.output), **figures}
-        return Result(document, lambda: print(*told, sep="\n"))
+        return Result(document, lambda: print(*lines, sep="\n"))

@@ -65,12 +65,12 @@ class Report:
             def say(label: str) -> None:
                 bars.say(f"reading {label}")
 
-            parts = read_folders(self.folders, Path(scratch), say)
-            write_page(self.output, parts, Path(scratch), self.title)
+            contents = read_folders(self.folders, Path(scratch), say)
+            write_page(self.output, contents, Path(scratch), self.title)
         return self._written()
 
     def _written(self) -> Result:
         path, size = self.output.resolve(), self.output.stat().st_size
         amount = f"{size / 1e6:.1f} MB" if size > 1e6 else f"{size / 1e3:.1f} kB"
-        told = f"Written: {path} ({amount})"
-        return Result({"output": str(path), "bytes": size}, lambda: print(told))
+        message = f"Written: {path} ({amount})"
+        return Result({"output": str(path), "bytes": size}, lambda: print(message))

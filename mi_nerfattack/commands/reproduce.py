@@ -78,19 +78,19 @@ class Reproduce:
             files.check_folder(self.output)
         workers = Processes(cells_at_a_time(self.workers, self.cores), pieces_each=1)
         variant.ensure()
-        wanted = read_replay(self.folder, self.row, self.rows, self.seed)
-        with self._place({cell.id for cell in wanted.cells}) as place:
+        replay = read_replay(self.folder, self.row, self.rows, self.seed)
+        with self._place({cell.id for cell in replay.cells}) as place:
             output = Path(place)
             if self.drives_only:
-                take_checkpoints(wanted, self.folder, output)
-            sweep = do_cells(wanted.cells, output, self.cores, workers)
-            errors = {wanted.cells[i].id: told for i, told in sweep.errors.items()}
+                take_checkpoints(replay, self.folder, output)
+            sweep = do_cells(replay.cells, output, self.cores, workers)
+            errors = {replay.cells[i].id: error for i, error in sweep.errors.items()}
             again, made = read_table(sweep.table), read_made(output)
-            found = compare_rows(wanted, again, made, errors)
-        code = int(bool(errors) or self._is_exceeded(found))
-        return Result(found, lambda: print(*sentences(found), sep="\n"), code)
+            comparison = compare_rows(replay, again, made, errors)
+        code = int(bool(errors) or self._is_exceeded(comparison))
+        return Result(comparison, lambda: print(*sentences(comparison), sep="\n"), code)
 
-    def _place(self, wanted: Collection[str]) -> AbstractContextManager[str | Path]:
+    def _place(self, cell_ids: Collection[str]) -> AbstractContextManager[str | Path]:
         """Return the folder of the repetition, which may be for a while."""
         from mi_nerfattack.errors import InputError
         from mi_nerfattack.experiment.sweep.table import RESULTS, read_table
@@ -101,17 +101,17 @@ class Reproduce:
             raise InputError(f"{self.output}: the sweep's own folder; choose another")
         if (path := self.output / RESULTS).exists():
             held = set(read_table(path)["cell"])
-            if others := held.difference(wanted):
+            if others := held.difference(cell_ids):
                 raise InputError(
                     f"{path}: has rows of other cells, such as {min(others)}, which "
                     "would be lost; choose another folder"
                 )
         return nullcontext(self.output)
 
-    def _is_exceeded(self, found: Mapping[str, Any]) -> bool:
+    def _is_exceeded(self, comparison: Mapping[str, Any]) -> bool:
         """Whether a row differs by more than was allowed, or is not there."""
         limit = self.tolerance
         return limit is not None and any(
             row["difference"] is None or row["difference"]["cross_track_mean_m"] > limit
-            for row in found["rows"]
+            for row in comparison["rows"]
         )

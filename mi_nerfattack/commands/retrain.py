@@ -117,12 +117,12 @@ class Retrain:
         from mi_nerfattack.training.dataset import find_shards
 
         training = self._user_training()
-        about = self._check_outputs(training)
+        comparison_path = self._check_outputs(training)
         variant.ensure()
         attacks = read_found([*self.run_folders, *self.held_out])
         policy, place = self._policy(attacks, training), self._place(attacks)
         order = self._order(policy, training)
-        more = [shard for folder in self.more for shard in find_shards(folder)]
+        old_shards = [path for folder in self.more for path in find_shards(folder)]
         groups, others = self._groups(attacks)
         settings = self._settings(policy.attacked, place)
         sites = self._sites(place, settings, attacks[0].scenario.vehicle)
@@ -137,7 +137,7 @@ class Retrain:
         with StageBars() as bars:
             before = drives.drive(BEFORE, workers, bars.counter)
             shards = frames.collect(bars.show) if training else []
-            card = {} if training else self._fine_tune(frames, policy, more, bars)
+            card = {} if training else self._fine_tune(frames, policy, old_shards, bars)
         trained: dict[str, Any] = {}
         if training:  # without bars, which the output of a command would break
             trained = self._train(training, order, policy, shards, groups[OLD][0])
@@ -145,9 +145,9 @@ class Retrain:
             setting = policy.setting(self.output)
             after = drives.drive(AFTER, workers, bars.counter, setting)
             anew = self._adapt(drives, before, after, setting, workers, bars)
-        document = _describe(policy.about, groups, anew, others) | trained
+        document = _describe(policy.content, groups, anew, others) | trained
         document["table"] = table_rows(before, after)
-        files.write_json(about, document)
+        files.write_json(comparison_path, document)
 
         def show() -> None:
             tables = [card_table(card)] if card else []
@@ -228,17 +228,17 @@ class Retrain:
         self,
         frames: FramesAmong,
         policy: Successor,
-        more: Sequence[Path],
+        old_shards: Sequence[Path],
         bars: StageBars,
     ) -> dict[str, Any]:
         """Train PilotNet further, and write it; return its card."""
         from mi_nerfattack.policy.pilotnet import PilotNet
         from mi_nerfattack.training.record import training_record, write_trained
 
-        if not more:
+        if not old_shards:
             bars.say("no --more: trained on new frames alone, it may forget others")
         assert policy.file is not None
-        result = frames.imitate(PilotNet.load(policy.file), more, bars.show)
+        result = frames.imitate(PilotNet.load(policy.file), old_shards, bars.show)
         command = command_line("retrain", self)
         record = training_record(
             frames.settings, frames.sites, self.data, result, command
@@ -252,21 +252,21 @@ class Retrain:
         order: TrainingOrder,
         policy: Successor,
         shards: Sequence[Path],
-        found: FoundAttack,
+        attack: FoundAttack,
     ) -> dict[str, Any]:
         """Let somebody else's training write the new policy; return what it was."""
         from mi_nerfattack.experiment.retrain.new_policy import install, try_policy
         from mi_nerfattack.experiment.retrain.user_training import train_once
         from mi_nerfattack.training.record import count_frames
 
-        about = train_once(
+        record = train_once(
             training,
             order,
             shards,
-            lambda: try_policy(found, policy.setting(order.out), self.adaptive),
+            lambda: try_policy(attack, policy.setting(order.out), self.adaptive),
         )
         install(order.out, self.output)
-        return {"training": {**about, "frames": count_frames(self.data, shards)}}
+        return {"training": {**record, "frames": count_frames(self.data, shards)}}
 
     def _adapt(
         self,
@@ -324,8 +324,8 @@ class Retrain:
             print(f"{label}: left out: {trouble}")
         trained = attacks[: len(self.run_folders)]
         groups = {
-            OLD: [found for found in solvable if found in trained],
-            HELD_OUT: [found for found in solvable if found not in trained],
+            OLD: [attack for attack in solvable if attack in trained],
+            HELD_OUT: [attack for attack in solvable if attack not in trained],
         }
         if not groups[OLD]:
             raise InputError("RUN: none can be driven by the expert; give other runs")
@@ -380,8 +380,8 @@ def _describe(
     return {
         "schema": 1,
         "policy": policy,
-        "runs": [found.about for found in groups[OLD]],
-        "held_out": [found.about for found in groups.get(HELD_OUT, ())],
-        "adaptive": [found.about for found in anew],
+        "runs": [attack.description for attack in groups[OLD]],
+        "held_out": [attack.description for attack in groups.get(HELD_OUT, ())],
+        "adaptive": [attack.description for attack in anew],
         "left_out": others,
     }

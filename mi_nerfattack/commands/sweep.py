@@ -81,13 +81,18 @@ class Sweep:
         if self.ray is not None and self.submitit is not None:
             raise InputError("--ray: stands beside --submitit; give one of them")
         alone = Processes(self._count(), pieces_each=1)  # checks the number, too
-        each = self.cores, self.memory_gb
         if self.ray is not None:
-            return RayTasks(self.ray, *each, self.workers)
+            return RayTasks(self.ray, self.cores, self.memory_gb, count=self.workers)
         if self.submitit is None:
             return alone
-        jobs = self.output.resolve() / "slurm", self.submitit, *each, self.minutes
-        return SlurmJobs(*jobs, self._count())
+        return SlurmJobs(
+            self.output.resolve() / "slurm",
+            self.submitit,
+            self.cores,
+            memory_gb=self.memory_gb,
+            minutes=self.minutes,
+            count=self._count(),
+        )
 
     def _run(self, cells: list[Cell], workers: AbstractWorkers, taken: Taken) -> Result:
         from mi_nerfattack.commands.shared.cells import do_cells
@@ -97,7 +102,7 @@ class Sweep:
         sweep = do_cells(cells, self.output, self.cores, workers, taken)
         document = write_summary(sweep.work.folder, taken.attacks)
         failed = {cells[i].id: error for i, error in sorted(sweep.errors.items())}
-        found = {
+        summary = {
             "cells": len(cells),
             "complete": len(sweep.complete),
             "failed": failed,
@@ -115,4 +120,4 @@ class Sweep:
             for cell, error in failed.items():
                 print(f"failed: {cell}: {error.splitlines()[-1]}")
 
-        return Result(found, show, int(bool(failed)))
+        return Result(summary, show, int(bool(failed)))

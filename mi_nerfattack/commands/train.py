@@ -141,10 +141,17 @@ class Train:
             lines = [f"{self.data / name}: {n} frames" for name, n in counts.items()]
             return Result({"data": counts}, lambda: print("\n".join(lines)))
         start = self.start and PilotNet.load(resolve(str(self.start)))
-        more = self._more()
+        earlier_shards = self._earlier_shards()
         with StageBars() as bars:
             result = imitate(
-                sites, routes, settings, self.data, workers, bars.show, start, more
+                sites,
+                routes,
+                settings,
+                self.data,
+                workers,
+                bars.show,
+                start,
+                earlier_shards,
             )
         command = command_line("train", self)
         record = training_record(settings, sites, self.data, result, command)
@@ -191,11 +198,19 @@ class Train:
         from mi_nerfattack.render.posed import PosedField
         from mi_nerfattack.report.plots.place import routes_picture
 
-        look, sensor = (place.camera, place.mount), None
+        sensor = None
         if place.field is not None:
             field = PosedField(load_field(place.field), place.field_pose)
-            sensor = field_sensor(field, [], *look)
-        routes_picture(picture, place.scene, routes, *look, sensor, title)
+            sensor = field_sensor(field, [], place.camera, mount=place.mount)
+        routes_picture(
+            picture,
+            place.scene,
+            routes,
+            camera=place.camera,
+            mount=place.mount,
+            sensor=sensor,
+            title=title,
+        )
 
     def _file(self) -> PolicyFile:
         """Read the file of --like; an empty one where there is none."""
@@ -316,13 +331,15 @@ class Train:
         names = (
             "frames validation_frames dagger_rounds dagger_frames dagger_epochs epochs"
         )
-        given = {name: getattr(self, name) for name in names.split()}
-        given = {name: value for name, value in given.items() if value is not None}
+        overrides = {name: getattr(self, name) for name in names.split()}
+        overrides = {
+            name: value for name, value in overrides.items() if value is not None
+        }
         if self.frames_only:
-            given["dagger_rounds"] = 0
-        return replace(find_preset(self.preset), **given)
+            overrides["dagger_rounds"] = 0
+        return replace(find_preset(self.preset), **overrides)
 
-    def _more(self) -> list[Path]:
+    def _earlier_shards(self) -> list[Path]:
         from mi_nerfattack.training.dataset import find_shards
 
         return [shard for folder in self.more for shard in find_shards(folder)]

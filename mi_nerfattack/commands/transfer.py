@@ -96,7 +96,7 @@ class Transfer:
         files.check_folder(self.output)
         variant.ensure()
         work = self._work()
-        policies = [found.scenario.policy for found in work.attacks]
+        policies = [attack.scenario.policy for attack in work.attacks]
         alone = any(isinstance(policy, HttpSection) for policy in policies)
         workers = chosen_workers(self.workers, alone)
         check_output(self.output)
@@ -130,5 +130,11 @@ class Transfer:
         columns = make_columns(self.environments, self.conditions, self.spp)
         runs = chosen_runs(self.run_folders, self.best)
         attacks, store = read_found(runs), Store(self.output / DRIVES)
-        choices = self.cases, self.runs, self.seed
-        return TransferDrives(store, attacks, columns, *choices)
+        return TransferDrives(
+            store,
+            attacks,
+            columns,
+            cases=self.cases,
+            starts=self.runs,
+            seed=self.seed,
+        )

@@ -24,6 +24,6 @@ class Upgrade:
         new = upgraded_text(self.file, text)
         if new != text:
             files.write_text(self.file, new)
-        told = "is of the form of today" if new == text else "rewritten"
-        print(f"{self.file}: {told}")
+        outcome = "is of the form of today" if new == text else "rewritten"
+        print(f"{self.file}: {outcome}")
         return 0

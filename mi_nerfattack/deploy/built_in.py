@@ -97,8 +97,8 @@ def built_in_shapes(objects: Sequence[BuiltInObject]) -> dict[str, Any]:
         )
         pose = item.pose
         placed = part.placed(pose.scale * pose.rotation, pose.translation)
-        found = mitsuba_shapes(TexturedMesh("built-in object", (placed,)))
-        shapes[f"built_in_{index:03d}"] = found["part_000"]
+        meshes = mitsuba_shapes(TexturedMesh("built-in object", (placed,)))
+        shapes[f"built_in_{index:03d}"] = meshes["part_000"]
     return shapes
 
 
@@ -187,18 +187,18 @@ def _field_triangles(field: GridField) -> tuple[np.ndarray, np.ndarray]:
     """Return corners and normals, (m, 3, 3) each, of a field's surface."""
     surface = field_surface(field)
     corners, normals = surface.vertices[surface.faces], surface.normals[surface.faces]
-    kept = has_area(corners)
-    return corners[kept], normals[kept]
+    mask = has_area(corners)
+    return corners[mask], normals[mask]
 
 
 def _solid_corners(mesh: TexturedMesh) -> np.ndarray:
     """Return all triangles that have an area, (m, 3, 3)."""
-    if not all(part.is_solid for part in mesh.parts):
+    if not all(part.is_solid for part in mesh.submeshes):
         raise InputError(
             f"{mesh.name}: is partly transparent, which a built-in object cannot be; "
             "leave out the mesh for the surface of the field"
         )
-    corners = np.concatenate([part.vertices[part.faces] for part in mesh.parts])
+    corners = np.concatenate([part.vertices[part.faces] for part in mesh.submeshes])
     return corners[has_area(corners)]
 
 

@@ -32,20 +32,22 @@ class Control:
 _STEERING = {"rad/s": "heading_rate", "rad": "steering"}
 
 
-def control_names(unit: str, more: Sequence[Control]) -> tuple[str, ...]:
+def control_names(unit: str, others: Sequence[Control]) -> tuple[str, ...]:
     """Return the names of a vehicle's controls.
 
     Args:
         unit: of the first one.
-        more: the others.
+        others: those after the first one.
     """
-    return _STEERING.get(unit, "control"), *(control.name for control in more)
+    return _STEERING.get(unit, "control"), *(control.name for control in others)
 
 
-def acceleration_of(more: Sequence[Control]) -> tuple[float, float] | None:
+def acceleration_of(controls: Sequence[Control]) -> tuple[float, float] | None:
     """Return the lowest and the highest acceleration, m/s^2, where it is a control."""
-    found = [item for item in more if item.name == "acceleration"]
-    return (found[0].lowest, found[0].highest) if found else None
+    accelerations = [item for item in controls if item.name == "acceleration"]
+    return (
+        (accelerations[0].lowest, accelerations[0].highest) if accelerations else None
+    )
 
 
 @dataclass(frozen=True)

@@ -72,8 +72,8 @@ class CameraFrame:
             along the ray.
         """
         opaque = np.ones((*self.depth.shape, 1), np.float32)
-        whole = {"": np.concatenate([self.light, opaque], axis=-1), "Z": self.depth}
-        return whole if self.split is None else whole | self.split(objects)
+        layers = {"": np.concatenate([self.light, opaque], axis=-1), "Z": self.depth}
+        return layers if self.split is None else layers | self.split(objects)
 
 
 def join_frames(frames: Sequence[CameraFrame], layout: Layout) -> CameraFrame:

@@ -157,27 +157,27 @@ class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
 
     def _controls(self, action: np.ndarray) -> float | np.ndarray:
         """Return the controls that an action stands for."""
-        names, more = self.environment.control_names, self.environment.more_controls
+        names, others = self.environment.control_names, self.environment.more_controls
         size = len(names)
-        wanted = (
+        expected = (
             "one control, shape (1,)"
             if size == 1
             else f"{size} controls ({', '.join(names)}), shape ({size},)"
         )
         try:
-            given = np.asarray(action)
+            numbers = np.asarray(action)
         except (TypeError, ValueError) as error:
-            raise InputError(f"action: {action!r}; {wanted}") from error
-        if given.size != size:
-            raise InputError(f"action: shape {given.shape}; {wanted}")
-        if given.dtype.kind not in "iuf":
+            raise InputError(f"action: {action!r}; {expected}") from error
+        if numbers.size != size:
+            raise InputError(f"action: shape {numbers.shape}; {expected}")
+        if numbers.dtype.kind not in "iuf":
             raise InputError(f"action: {action!r}; a number from -1 to 1")
         if size == 1:
-            return float(given.item()) * self.environment.max_control
-        shares = given.reshape(-1).astype(np.float64)
+            return float(numbers.item()) * self.environment.max_control
+        shares = numbers.reshape(-1).astype(np.float64)
         largest = self.environment.max_control
-        high = np.array([largest, *(control.highest for control in more)])
-        low = np.array([largest, *(-control.lowest for control in more)])
+        high = np.array([largest, *(control.highest for control in others)])
+        low = np.array([largest, *(-control.lowest for control in others)])
         return shares * np.where(shares < 0, low, high)
 
     def _require_open(self) -> None:
@@ -225,7 +225,7 @@ def make_gym(
     routes: Sequence[str] = (),
     size_px: tuple[int, int] | None = None,
     render_mode: str | None = None,
-    **more: Any,
+    **options: Any,
 ) -> DrivingEnv:
     """Make a `DrivingEnv` of a registered environment; `gymnasium.make` calls it.
 
@@ -237,7 +237,7 @@ def make_gym(
         size_px: width and height of the images; the place's camera decides by default,
             and a recording's own in any case.
         render_mode: "rgb_array" or None.
-        **more: to `DrivingEnv`.
+        **options: to `DrivingEnv`.
 
     Raises:
         InputError: the environment cannot be made, has images of another size than
@@ -250,12 +250,14 @@ def make_gym(
     if size_px is not None:
         place.rig.require_one("size_px", "leave it out, and size each camera")
         place = replace(place, camera=place.camera.resized(*size_px))
-    found = load_routes(place.routes, routes)
+    chosen_routes = load_routes(place.routes, routes)
     environment = make_environment(name, place, conditions)
-    more.setdefault("width", place.car.width)
+    options.setdefault("width", place.car.width)
     try:
         _check_size(name, environment, size_px)
-        return DrivingEnv(environment, found, render_mode=render_mode, **more)
+        return DrivingEnv(
+            environment, chosen_routes, render_mode=render_mode, **options
+        )
     except InputError:
         environment.close()
         raise

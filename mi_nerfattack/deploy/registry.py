@@ -260,13 +260,13 @@ def environment_versions(name: str) -> dict[str, str]:
     """
     if name not in ENVIRONMENTS:
         return {name: offered_environment(name).package}
-    found = {}
+    versions = {}
     for package in _NEEDED.get(name, ()):
         try:
-            found[package] = importlib.metadata.version(package)
+            versions[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
-            found[package] = "not installed"  # making the environment says so
-    return found
+            versions[package] = "not installed"  # making the environment says so
+    return versions
 
 
 _NEEDED = {"mujoco": ("mujoco",), "mujoco_gl": ("mujoco",), "carla": ("carla",)}

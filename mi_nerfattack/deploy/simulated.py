@@ -87,7 +87,7 @@ class AbstractSimulation(AbstractEnvironment):
             return frame
         image = policy_image(frame.image)
         exposure, blur = np.zeros((1, 3)), np.full(1, self.blur_px)
-        seen = disturbed(
+        observation = disturbed(
             image,
             exposure,
             blur,
@@ -96,7 +96,7 @@ class AbstractSimulation(AbstractEnvironment):
             self._steps,
             layout=self.rig.layout,
         )
-        image = np.round(255 * np.array(seen)[0]).astype(np.uint8)
+        image = np.round(255 * np.array(observation)[0]).astype(np.uint8)
         return replace(frame, image=image, linear=frame.light)
 
     @abstractmethod

@@ -225,9 +225,9 @@ class PlaceSite(AbstractSite):
 
 def _car(car: Car) -> dict[str, Any]:
     """Return a car's numbers; of a car with one control nothing about others."""
-    more = ("more_controls",) if car.more_controls else ()
-    kept = [f.name for f in fields(car) if f.name != "more_controls"]
-    return {name: asdict(car)[name] for name in (*kept, *more)}
+    extra = ("more_controls",) if car.more_controls else ()
+    names = [f.name for f in fields(car) if f.name != "more_controls"]
+    return {name: asdict(car)[name] for name in (*names, *extra)}
 
 
 def expert_of(site: AbstractSite, route: Route) -> AbstractExpert:

@@ -94,9 +94,9 @@ class AbstractDrives(AbstractWork):
         """Drive once, and keep the drive."""
         begun = time.monotonic()
         with one_thread():
-            found = driver.drive(spec, on_step)
-        self.store.add(spec, found, time.monotonic() - begun)
-        return found
+            drive = driver.drive(spec, on_step)
+        self.store.add(spec, drive, time.monotonic() - begun)
+        return drive
 
     def close(self, opened: AbstractDriver) -> None:
         """Close the driver."""
@@ -107,7 +107,7 @@ def run_drives(
     work: AbstractDrives,
     workers: AbstractWorkers,
     progress: OnSteps = _quiet,
-    on_groups: Callable[[Groups], None] = lambda found: None,
+    on_groups: Callable[[Groups], None] = lambda groups: None,
 ) -> list[list[Finished]]:
     """Do the drives that are missing.
 
@@ -126,16 +126,16 @@ def run_drives(
             the first drive; later, whatever a drive raises.
     """
     groups, store = work.groups, work.store
-    found = [[store.read(spec) for spec in group] for group in groups]
-    pairs = [list(zip(*both, strict=True)) for both in zip(groups, found, strict=True)]
+    stored = [[store.read(spec) for spec in group] for group in groups]
+    pairs = [list(zip(*both, strict=True)) for both in zip(groups, stored, strict=True)]
     left = [[spec for spec, item in pair if item is None] for pair in pairs]
     missing = [spec for group in left for spec in group]
     total = sum(spec.steps for group in groups for spec in group)
     done = total - sum(spec.steps for spec in missing)
     work.check(missing)
-    whole = {
+    finished = {
         index: [item for item in items if item is not None]
-        for index, items in enumerate(found)
+        for index, items in enumerate(stored)
         if not left[index]
     }
 
@@ -146,10 +146,10 @@ def run_drives(
             if (item := store.read(spec)) is None:
                 raise InputError(f"{store.path(spec)}: missing; it was removed")
             items.append(item)
-        whole[index] = items
+        finished[index] = items
         on_groups({index: items})
 
-    on_groups(dict(whole))
+    on_groups(dict(finished))
     pieces = [index for index, specs in enumerate(left) if specs]
     workers.run(work, pieces, tally(progress, done, total), on_end)
-    return [whole[index] for index in range(len(groups))]
+    return [finished[index] for index in range(len(groups))]

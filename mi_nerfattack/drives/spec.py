@@ -28,7 +28,7 @@ class DriveSpec:
         seed: of the environment.
         steps: control periods, at most.
         identity: everything that the result of the drive depends on, see `identify`.
-        how: what the driver needs besides; not part of the identity.
+        context: what the driver needs besides; not part of the identity.
     """
 
     environment: str
@@ -38,7 +38,7 @@ class DriveSpec:
     seed: int
     steps: int
     identity: Mapping[str, str]
-    how: Any = None
+    context: Any = None
 
     @cached_property
     def digest(self) -> str:
@@ -57,10 +57,10 @@ def identify(environment: str | None, decisive: Mapping[str, Any]) -> dict[str, 
     names = versions()
     if environment is not None:
         names |= environment_versions(environment)
-    found = {"format": FORMAT, **flatten("version", names)}
+    identity = {"format": FORMAT, **flatten("version", names)}
     for name, value in decisive.items():
-        found[name] = value if isinstance(value, str) else json.dumps(value)
-    return found
+        identity[name] = value if isinstance(value, str) else json.dumps(value)
+    return identity
 
 
 def short_digest(identity: Mapping[str, str]) -> str:

@@ -10,7 +10,7 @@ from urllib.parse import quote
 from mi_nerfattack.drives.spec import FORMAT, DriveSpec
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
-from mi_nerfattack.io.resumable import Record, Unit, misfits_told
+from mi_nerfattack.io.resumable import Record, Unit, misfits_reported
 from mi_nerfattack.rollout.drive import Drive
 
 _REMEDY = "remove the file"
@@ -77,17 +77,24 @@ class Store:
             InputError: the file is damaged.
         """
         unit = self._unit(self.path(spec), spec)
-        kept = unit.read()
-        if kept is None and self.shared is not None:
-            kept = self._unit(self.shared / _name(spec), spec).read()
-            if kept is not None:
+        stored = unit.read()
+        if stored is None and self.shared is not None:
+            stored = self._unit(self.shared / _name(spec), spec).read()
+            if stored is not None:
                 files.make_folder(unit.path.parent)
-                unit.write(kept.tensors, kept.record)
-        if kept is None:
+                unit.write(stored.tensors, stored.record)
+        if stored is None:
             return None
-        about = spec.environment, spec.route, spec.case, spec.run, spec.seed
-        with misfits_told(unit.path):
-            return Finished(Drive(*about, **kept.tensors), kept.record.wall_s)
+        with misfits_reported(unit.path):
+            drive = Drive(
+                environment=spec.environment,
+                route=spec.route,
+                case=spec.case,
+                run=spec.run,
+                seed=spec.seed,
+                **stored.tensors,
+            )
+            return Finished(drive, stored.record.wall_s)
 
     def add(self, spec: DriveSpec, drive: Drive, wall_s: float) -> None:
         """Write a drive.
@@ -116,9 +123,9 @@ class Store:
 
     def remove_others(self, specs: Collection[DriveSpec]) -> None:
         """Remove the files of all other drives."""
-        wanted = {self.path(spec) for spec in specs}
+        paths = {self.path(spec) for spec in specs}
         for path in drive_files(self.folder):
-            if path not in wanted:
+            if path not in paths:
                 path.unlink()
 
     def remove(self) -> None:
@@ -151,13 +158,19 @@ def read_drive(path: Path) -> Drive:
     Raises:
         InputError: the file is missing, damaged, or of another format.
     """
-    kept = Unit(path, {"format": FORMAT}, DriveRecord, _REMEDY).read(force=True)
-    if kept is None:
+    stored = Unit(path, {"format": FORMAT}, DriveRecord, _REMEDY).read(force=True)
+    if stored is None:
         raise InputError(f"{path}: missing; it was removed")
-    record = kept.record
-    about = record.environment, record.route, record.case, record.run, record.seed
-    with misfits_told(path):
-        return Drive(*about, **kept.tensors)
+    record = stored.record
+    with misfits_reported(path):
+        return Drive(
+            environment=record.environment,
+            route=record.route,
+            case=record.case,
+            run=record.run,
+            seed=record.seed,
+            **stored.tensors,
+        )
 
 
 def read_drives(folder: Path) -> list[Drive]:

@@ -19,14 +19,14 @@ MAX_BYTES = 1 << 30
 #: Columns that tell the drives of one policy apart.
 LABELS = ("route", "environment", "case", "run")
 #: Pandas' types of columns in which values can be missing.
-TEXT, WHOLE, NUMBER, TRUTH = "string", "Int64", "float64", "boolean"
+TEXT, INTEGER, NUMBER, TRUTH = "string", "Int64", "float64", "boolean"
 #: Columns of a table with one row per drive and step.
 STEPS = {
     **dict.fromkeys(("environment", "route", "case"), TEXT),
-    **dict.fromkeys(("run", "seed", "step"), WHOLE),
+    **dict.fromkeys(("run", "seed", "step"), INTEGER),
     **dict.fromkeys(("time_s", "x_m", "y_m", "heading_rad", "control"), NUMBER),
     "cross_track_m": NUMBER,
-    "departed": WHOLE,
+    "departed": INTEGER,
 }
 #: Columns after them, a number each: ``state_3`` is row 3, from 0, of the state, and
 #: ``control_1`` the second of several controls, the first of which is ``control``.
@@ -91,7 +91,7 @@ def write_steps(
     empty where an environment has none. Of several controls `control` is the first, and
     the others follow as `control_1`, ...
     """
-    parts = []
+    tables = []
     for drive in drives:
         out = drive.departed(lane_of(drive.route, lanes).wheel_m).astype(int)
         labels = (drive.environment, drive.route, drive.case, drive.run, drive.seed)
@@ -99,12 +99,12 @@ def write_steps(
         steps = range(1, len(out) + 1)
         columns = (*labels, steps, drive.time_s, *drive.poses[1:].T, *figures)
         named = dict(zip(STEPS, columns, strict=True))
-        more = enumerate(drive.states[1:, 3:].T, start=3)
-        named |= {f"state_{row}": values for row, values in more}
+        state_rows = enumerate(drive.states[1:, 3:].T, start=3)
+        named |= {f"state_{row}": values for row, values in state_rows}
         others = drive.controls.reshape(len(out), -1).T[1:]
         named |= {f"control_{k}": values for k, values in enumerate(others, start=1)}
-        parts.append(pd.DataFrame(named))
-    write_csv(path, pd.concat(parts))
+        tables.append(pd.DataFrame(named))
+    write_csv(path, pd.concat(tables))
 
 
 def lane_of(route: str, lanes: Mapping[str, Lane]) -> Lane:
@@ -144,22 +144,22 @@ def write_csv(path: str | Path, table: pd.DataFrame) -> None:
 
 
 def read_csv(
-    path: str | Path, types: Mapping[str, str], more: re.Pattern[str] | None = None
+    path: str | Path, types: Mapping[str, str], further: re.Pattern[str] | None = None
 ) -> pd.DataFrame:
     """Read a table of :func:`write_csv`.
 
     Args:
         path: CSV file.
         types: pandas' types of all its columns; empty fields are missing values.
-        more: matches the names of further columns, of numbers.
+        further: matches the names of further columns, of numbers.
 
     Raises:
         InputError: the file is missing, too large or damaged, or has other columns.
     """
     raw = files.read_bytes(path, MAX_BYTES)
     header = raw[: raw.find(b"\n")].decode(errors="replace").split(",")
-    if more is not None:
-        types = {**dict.fromkeys(filter(more.fullmatch, header), NUMBER), **types}
+    if further is not None:
+        types = {**dict.fromkeys(filter(further.fullmatch, header), NUMBER), **types}
     if wrong := sorted(set(header) ^ set(types)):
         raise InputError(
             f"{path}: not a table of this kind: columns {', '.join(wrong):.200} are "

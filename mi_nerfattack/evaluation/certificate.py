@@ -31,8 +31,8 @@ def chance_interval(count: int, total: int, confidence: float) -> tuple[float, f
     """
     import scipy.stats  # it takes a second
 
-    found = scipy.stats.binomtest(count, total).proportion_ci(confidence, "exact")
-    return float(found.low), float(found.high)
+    interval = scipy.stats.binomtest(count, total).proportion_ci(confidence, "exact")
+    return float(interval.low), float(interval.high)
 
 
 def chance_bound(count: int, total: int, confidence: float) -> float:
@@ -101,8 +101,8 @@ def agreement(predicted: np.ndarray, real: np.ndarray) -> Agreement | None:
     if n < 3 or not square or not real.any():
         return None
     slope = float(predicted @ real) / square
-    rest = real - slope * predicted
-    error = float(np.sqrt(rest @ rest / (n - 1) / square))
+    residuals = real - slope * predicted
+    error = float(np.sqrt(residuals @ residuals / (n - 1) / square))
     reach = float(scipy.stats.t.ppf(0.975, n - 1)) * error
     cosine = float(predicted @ real) / float(np.sqrt(square * (real @ real)))
     at = np.arctanh(np.clip(cosine, -1 + 1e-12, 1 - 1e-12))

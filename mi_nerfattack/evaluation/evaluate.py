@@ -22,7 +22,7 @@ from mi_nerfattack.evaluation.metrics import card_figures
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.random_textures import random_texture
 from mi_nerfattack.policy.base import AbstractPolicy
-from mi_nerfattack.ranges import Count, Whole, checked
+from mi_nerfattack.ranges import Count, Natural, checked
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.rollout.drive import (
     EXPERT,
@@ -62,8 +62,8 @@ class EvaluateSettings:
     """
 
     runs: Count = 20
-    objects: tuple[Whole, ...] = (1,)
-    seed: Whole = 0
+    objects: tuple[Natural, ...] = (1,)
+    seed: Natural = 0
     margin_m: float = 2.0
     horizon: Count = 1000
     scatter: Scatter = STARTS
@@ -220,9 +220,18 @@ def evaluate(
     drives: dict[tuple[str, str, str], list[Drive]] = {}
     count = tally(progress, 0, total)
     for environment, route, case, run in jobs:
-        about = case, run, objects, surroundings, settings
-        found = evaluate_run(environment, policy, route, *about, lambda step: count(1))
-        drives.setdefault((environment.name, route.name, case), []).append(found)
+        driven = evaluate_run(
+            environment,
+            policy,
+            route,
+            case=case,
+            run=run,
+            objects=objects,
+            surroundings=surroundings,
+            settings=settings,
+            on_step=lambda step: count(1),
+        )
+        drives.setdefault((environment.name, route.name, case), []).append(driven)
     return make_card(drives, limits)
 
 
@@ -248,9 +257,11 @@ def make_card(
         figures = card_figures(group, limits[route])
         expert = drives.get((label, route, EXPERT))
         if case == NO_OBJECT:
-            seen = card_figures(expert, limits[route]) if expert else None
+            expert_figures = card_figures(expert, limits[route]) if expert else None
             names = ("n", "cross_track_mean_m", "cross_track_max_m", "drives_departed")
-            figures["expert"] = seen and {name: seen[name] for name in names}
+            figures["expert"] = expert_figures and {
+                name: expert_figures[name] for name in names
+            }
         card.setdefault(label, {}).setdefault(route, {})[case] = figures
     return card
 
@@ -289,8 +300,15 @@ def check_places(
         for route in routes:
             for count in settings.counts.values():
                 for run in range(settings.runs):
-                    arguments = (route, count, run, objects, surroundings, settings)
-                    place_objects(period, *arguments)
+                    place_objects(
+                        period,
+                        route,
+                        count,
+                        run=run,
+                        objects=objects,
+                        surroundings=surroundings,
+                        settings=settings,
+                    )
 
 
 def place_objects(

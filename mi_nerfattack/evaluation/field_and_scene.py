@@ -25,7 +25,7 @@ from mi_nerfattack.fit.scores import (
     least,
     mean,
 )
-from mi_nerfattack.ranges import Positive, Whole, checked
+from mi_nerfattack.ranges import Natural, Positive, checked
 from mi_nerfattack.render.camera.intrinsics import (
     Camera,
     CameraMount,
@@ -64,8 +64,8 @@ class CompareOptions:
     lateral_m: float = 0.0
     spp: Annotated[int, Field(ge=2)] = 64
     near_m: Positive = 15.0
-    seed: Whole = 0
-    worst: Whole = 2
+    seed: Natural = 0
+    worst: Natural = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,9 +232,9 @@ def depth_errors(shown: np.ndarray, depth: np.ndarray, near_m: float) -> np.ndar
         near_m: metres.
     """
     near = depth < near_m
-    wanted = depth[near].astype(np.float64)
-    error = np.abs(shown[near] - wanted)
-    return np.stack([error, error / wanted])
+    expected = depth[near].astype(np.float64)
+    error = np.abs(shown[near] - expected)
+    return np.stack([error, error / expected])
 
 
 def quantile(values: np.ndarray | Sequence[float], share: float) -> float:

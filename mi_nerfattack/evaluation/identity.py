@@ -33,9 +33,9 @@ class EnvironmentUnder:
     def label(self) -> str:
         """Key of the card: the name, with sky and exposure where they are unusual."""
         sky, exposure = self.conditions.sky, self.conditions.exposure_ev
-        parts = [] if sky == "day" and exposure == 0 else [sky]
-        parts += [f"{exposure:+g}EV"] if exposure else []
-        return "@".join([self.name, "".join(parts)]) if parts else self.name
+        suffixes = [] if sky == "day" and exposure == 0 else [sky]
+        suffixes += [f"{exposure:+g}EV"] if exposure else []
+        return "@".join([self.name, "".join(suffixes)]) if suffixes else self.name
 
 
 def identify(
@@ -66,14 +66,14 @@ def identify(
     if vehicle is not None:
         shared["vehicle"] = json_digest(section_content(vehicle))
     shared["settings"] = {**asdict(settings), "runs": None, "objects": None}
-    found = {}
+    identities = {}
     for under in environments:
         site = PlaceSite(under.name, place, _weather(under.conditions))
         shared["environment"] = json_digest(site.describe())
         for route in routes:
             shared["route"] = json_digest(_route_content(route))
-            found[under.label, route.name] = spec.identify(under.name, shared)
-    return found
+            identities[under.label, route.name] = spec.identify(under.name, shared)
+    return identities
 
 
 def _weather(conditions: Conditions) -> Weather:

@@ -16,7 +16,7 @@ import pydantic
 from mi_nerfattack.drives.table import drives_table, lane_of, records, with_starts
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.summary import summary
-from mi_nerfattack.ranges import Count, NonNegative, Positive, Share, Whole
+from mi_nerfattack.ranges import Count, Natural, NonNegative, Positive, Share
 from mi_nerfattack.rollout.drive import CASES, ENVIRONMENTS, RANDOM, Drive, Lane
 
 SCHEMA = 2
@@ -210,13 +210,13 @@ class _Model(pydantic.BaseModel):
 
 
 class _Run(_Model):
-    run: Whole
-    seed: Whole
+    run: Natural
+    seed: Natural
     steps: Count
     cross_track_mean_m: NonNegative
     cross_track_max_m: NonNegative
     cross_track_total: NonNegative
-    steps_departed: Whole
+    steps_departed: Natural
     wheel_out_s: NonNegative
     centre_out_s: NonNegative
     returned_s: Positive | None
@@ -230,8 +230,8 @@ class _Case(_Model):
     cross_track_mean_worst_run_m: NonNegative
     cross_track_max_m: NonNegative
     cross_track_total: NonNegative
-    steps_departed: Whole
-    drives_departed: Whole
+    steps_departed: Natural
+    drives_departed: Natural
     wheel_out_s: NonNegative
     centre_out_s: NonNegative
     objective: float | None = None
@@ -247,9 +247,9 @@ class _Case(_Model):
 class _Cost(_Model):
     wall_s: NonNegative
     peak_memory_mb: NonNegative
-    renders: Whole
+    renders: Natural
     checkpoint_s: NonNegative = 0.0
-    processes: Whole = 1
+    processes: Natural = 1
     forward_s: NonNegative = 0.0
     backward_s: NonNegative = 0.0
 
@@ -267,7 +267,7 @@ class _Baseline(_Model):
     equal_textures: Count | None = None  # unknown in runs of earlier versions
     deployment_textures: Count
     backward_multiple: NonNegative
-    best: Whole
+    best: Natural
     objectives: list[float]
     attack_objective: float
 
@@ -296,7 +296,7 @@ class _Optimised(_Model):
 
 
 class _Gain(_Model):
-    first: Whole
+    first: Natural
     predicted: float
     gain: float
 
@@ -317,7 +317,7 @@ class _Texture(_Model):
 class _Document(_Model):
     schema_version: int = pydantic.Field(alias="schema", ge=SCHEMA, le=SCHEMA)
     scenario: dict[str, Any]
-    seed: Whole
+    seed: Natural
     departure_limits_m: dict[str, Positive]
     routes: dict[str, dict[str, _Cases]] = pydantic.Field(min_length=1)
     cost: _Cost

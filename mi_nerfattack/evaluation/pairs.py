@@ -147,18 +147,19 @@ def compare_departures(
 
     _, first, second, _, _ = _paired(one, other, figure)
     a, b = first >= least, second >= least
-    alone = int((a & ~b).sum()), int((b & ~a).sum())
-    total, differing = len(a), sum(alone)
+    one_alone, other_alone = int((a & ~b).sum()), int((b & ~a).sum())
+    total, differing = len(a), one_alone + other_alone
     p_value = None
     if differing:
-        p_value = float(scipy.stats.binomtest(alone[0], differing).pvalue)
+        p_value = float(scipy.stats.binomtest(one_alone, differing).pvalue)
     return Departures(
-        int((a & b).sum()),
-        *alone,
-        int((~a & ~b).sum()),
-        share_interval(int(a.sum()), total),
-        share_interval(int(b.sum()), total),
-        p_value,
+        both=int((a & b).sum()),
+        one=one_alone,
+        other=other_alone,
+        neither=int((~a & ~b).sum()),
+        one_ci95=share_interval(int(a.sum()), total),
+        other_ci95=share_interval(int(b.sum()), total),
+        p_value=p_value,
     )
 
 
@@ -201,11 +202,11 @@ def _by_start(side: pd.DataFrame, figure: str) -> dict[tuple[str, int, int], flo
             raise InputError(f"{where}: twice on one side; give one method at a time")
         value = values[wrong][0]
         raise InputError(f"{where}: {figure} is {value}; give a finite number")
-    found: dict[tuple[str, int, int], list[float]] = {}
+    figures: dict[tuple[str, int, int], list[float]] = {}
     starts = zip(side["scenario"], side["seed"], side["start"], strict=True)
     for key, value in zip(starts, values.tolist(), strict=True):
-        found.setdefault(key, []).append(value)
-    return {key: float(np.mean(own)) for key, own in found.items()}
+        figures.setdefault(key, []).append(value)
+    return {key: float(np.mean(own)) for key, own in figures.items()}
 
 
 def _ratio(one: np.ndarray, other: np.ndarray, axis: int = -1) -> Any:

@@ -82,17 +82,17 @@ class SequentialTest(Section):
     def decisions(self, outcomes: Sequence[bool]) -> list[str]:
         """Return the decision after each drive; the first but "go on" stands."""
         low, high = self.bounds
-        found: list[str] = []
+        decisions: list[str] = []
         successes = 0
         for drives, outcome in enumerate(outcomes, start=1):
             successes += outcome
-            if found and found[-1] != GO_ON:
-                found.append(found[-1])
+            if decisions and decisions[-1] != GO_ON:
+                decisions.append(decisions[-1])
                 continue
             ratio = self.log_ratio(successes, drives)
             accepts, rejects = ratio >= high - _ROUNDING, ratio <= low + _ROUNDING
-            found.append(ACCEPT if accepts else REJECT if rejects else GO_ON)
-        return found
+            decisions.append(ACCEPT if accepts else REJECT if rejects else GO_ON)
+        return decisions
 
     def forecast(self, rate: float) -> Forecast:
         """Return what the test does at a rate of success in (0, 1), exactly.
@@ -153,8 +153,8 @@ class Criteria(Section):
         """What a success is."""
         least = self.at_least is not None
         limit = self.at_least if least else self.at_most
-        how = "at least" if least else "at most"
-        return f"{self.case}: {self.metric} of {how} {limit:g}"
+        comparison = "at least" if least else "at most"
+        return f"{self.case}: {self.metric} of {comparison} {limit:g}"
 
 
 def rate_interval(successes: int, drives: int) -> list[float]:

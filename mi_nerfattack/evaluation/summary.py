@@ -132,7 +132,7 @@ def _bootstrap(
 
     with warnings.catch_warnings(), np.errstate(invalid="ignore"):
         warnings.simplefilter("ignore", scipy.stats.DegenerateDataWarning)
-        found = scipy.stats.bootstrap(
+        bootstrap = scipy.stats.bootstrap(
             samples,
             statistic,
             confidence_level=0.95,
@@ -141,7 +141,7 @@ def _bootstrap(
             method="BCa",
             rng=np.random.default_rng(seed),
         )
-    ends = [float(end) for end in found.confidence_interval]
+    ends = [float(end) for end in bootstrap.confidence_interval]
     return None if np.isnan(ends).any() else ends
 
 
@@ -187,13 +187,13 @@ def summary(
     columns = {name: table[name].to_numpy(float) for name in _USED if name in table}
     ends = np.cumsum(np.bincount(groups))[:-1]
     own = np.split(np.argsort(groups, kind="stable"), ends)  # rows by group
-    found = [
+    summaries = [
         _figures({name: values[rows] for name, values in columns.items()}, unit, seed)
         for rows in own
         if len(unit := units[rows])
     ]
     labels = table.iloc[[rows[0] for rows in own if len(rows)]][list(by)]
-    return pd.concat([labels.reset_index(drop=True), pd.DataFrame(found)], axis=1)
+    return pd.concat([labels.reset_index(drop=True), pd.DataFrame(summaries)], axis=1)
 
 
 def _figures(
@@ -208,7 +208,7 @@ def _figures(
     errors, out_s = means(_ERROR), means(_OUT)
     count, drives = len(attacks), len(unit)
     out, left = int((out_s >= DEPARTED_S).sum()), int(columns["departed"].sum())
-    found = {
+    figures = {
         "attacks": count,
         "drives": drives,
         _ERROR: float(errors.mean()),
@@ -224,9 +224,9 @@ def _figures(
         if count >= FEWEST
         else None,
     }
-    found |= {name: float(means(name).mean()) for name in _MEANS if name in columns}
+    figures |= {name: float(means(name).mean()) for name in _MEANS if name in columns}
     if _LARGEST in columns:
-        found[_LARGEST] = float(columns[_LARGEST].max())
+        figures[_LARGEST] = float(columns[_LARGEST].max())
     if _STEPS in columns:
-        found[_STEPS] = int(columns[_STEPS].sum())
-    return found
+        figures[_STEPS] = int(columns[_STEPS].sum())
+    return figures

@@ -39,18 +39,18 @@ def verdict(document: Figures, surrogate: str) -> list[str]:
         document: as of `metrics.metrics_document`, with `converged` and what follows.
         surrogate: name of the environment that the attack was optimised in.
     """
-    found = []
+    sentences = []
     for route, environments in document["routes"].items():
         limit = document["departure_limits_m"][route]
         names = sorted(environments, key=lambda name: name != surrogate)
-        found += _lane({name: environments[name] for name in names}, limit)
-        found.append(_policy(environments, limit))
+        sentences += _lane({name: environments[name] for name in names}, limit)
+        sentences.append(_policy(environments, limit))
         for name in names:
-            found += _attack(document, name, environments[name], name == surrogate)
+            sentences += _attack(document, name, environments[name], name == surrogate)
     for name, replayed in document.get("replay", {}).items():
-        found += _replayed(name, replayed)
-    found += _search(document)
-    return found
+        sentences += _replayed(name, replayed)
+    sentences += _search(document)
+    return sentences
 
 
 def _lane(environments: Figures, limit: float) -> Iterator[str]:
@@ -60,20 +60,20 @@ def _lane(environments: Figures, limit: float) -> Iterator[str]:
         environments: by name, in the order of the sentence.
         limit: departure limit, metres.
     """
-    parts = []
+    clauses = []
     for name, cases in environments.items():
         if (attack := cases.get(ATTACK)) is None:
             continue
         left, beyond = attack["drives_departed"], attack["cross_track_max_m"] - limit
         if left:
-            how = f"at most {beyond:.2f} m beyond the limit"
+            margin = f"at most {beyond:.2f} m beyond the limit"
         else:
-            how = f"{-beyond:.2f} m to spare"
-        parts.append(f"{left} of {attack['n']} drives in {name} ({how})")
-    if parts:
+            margin = f"{-beyond:.2f} m to spare"
+        clauses.append(f"{left} of {attack['n']} drives in {name} ({margin})")
+    if clauses:
         yield (
             f"With the attacked objects, the policy leaves its lane in "
-            f"{' and in '.join(parts)}; up to {limit:.2f} m from the lane centre are "
+            f"{' and in '.join(clauses)}; up to {limit:.2f} m from the lane centre are "
             "allowed."
         )
 

@@ -49,7 +49,7 @@ from mi_nerfattack.vehicle.route.route import Route
 _EXPERT_CAMERA = from_fov(8, 3, 90.0)
 
 
-class _How(NamedTuple):
+class _Location(NamedTuple):
     """Where a drive takes place."""
 
     under: EnvironmentUnder
@@ -91,8 +91,14 @@ class EvaluateDrives(AbstractDrives):
     @cached_property
     def groups(self) -> Sequence[Sequence[DriveSpec]]:
         """Every drive; those of one environment and of one sort together."""
-        about = self.policy, self.place, self.environments, self.routes
-        identities = identify(*about, self.settings, self.vehicle)
+        identities = identify(
+            self.policy,
+            self.place,
+            self.environments,
+            routes=self.routes,
+            settings=self.settings,
+            vehicle=self.vehicle,
+        )
         return [
             [self._spec(under, route, case, run, identities[under.label, route.name])]
             for under in self.environments
@@ -118,7 +124,7 @@ class EvaluateDrives(AbstractDrives):
             seed=drawn_start(self.settings, route, run)[1],
             steps=self.settings.steps(route, self.place.period),
             identity={**shared, "case": case, "run": f"{run}"},
-            how=_How(under, route),
+            context=_Location(under, route),
         )
 
     def build_place(self) -> Place:
@@ -147,7 +153,7 @@ class EvaluateDrives(AbstractDrives):
                 some = self.first(objects, count)
                 only = replace(self.settings, objects=(count,))
                 check_places(self.place.period, self.routes, some, around, only)
-        for under in dict.fromkeys(spec.how.under for spec in missing):
+        for under in dict.fromkeys(spec.context.under for spec in missing):
             make_environment(under.name, self.build_place(), under.conditions).close()
 
     def describe(self) -> dict[str, Any]:
@@ -193,7 +199,7 @@ class EvaluateDriver(AbstractDriver):
 
     def drive(self, spec: DriveSpec, on_step: OnStep) -> Drive:
         """Drive once."""
-        under, route = spec.how
+        under, route = spec.context
         blind = spec.case == EXPERT
         environment = self.environment.get(
             (under.label, blind), lambda: self._make(under, blind)
@@ -276,8 +282,8 @@ def run_evaluation(
     files.make_folder(work.store.folder)
     drives: dict[tuple[str, str, str], list[Drive]] = {}
     seconds: dict[tuple[str, str], list[float]] = {}
-    found = run_drives(work, workers, progress)
-    for [spec], [item] in zip(work.groups, found, strict=True):
+    finished = run_drives(work, workers, progress)
+    for [spec], [item] in zip(work.groups, finished, strict=True):
         case = spec.case
         drives.setdefault((spec.environment, spec.route, case), []).append(item.drive)
         seconds.setdefault((spec.environment, case), []).append(item.wall_s)

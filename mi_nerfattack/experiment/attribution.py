@@ -37,7 +37,7 @@ def control_changes(drives: Sequence[Drive], unit: str, seed: int) -> dict[str, 
         unit: of the control.
         seed: of the bootstrap.
     """
-    found: dict[str, Any] = {}
+    figures: dict[str, Any] = {}
     for environment, group in _environments(drives).items():
         base = _own(group)
         cases: dict[str, Any] = {}
@@ -55,13 +55,13 @@ def control_changes(drives: Sequence[Drive], unit: str, seed: int) -> dict[str, 
                 "control_change_max": float(largest.max()),
                 "control_change_max_time_s": float(base.time_s[largest.argmax()]),
             }
-        found[environment] = {
+        figures[environment] = {
             "frames": len(base.controls),
             "control_unit": unit,
             "control_abs_mean": float(abs(base.first_controls).mean()),
             "cases": cases,
         }
-    return found
+    return figures
 
 
 def write_control_changes(output: Path, drives: Sequence[Drive]) -> None:
@@ -73,16 +73,16 @@ def write_control_changes(output: Path, drives: Sequence[Drive]) -> None:
     """
     if not drives:
         return
-    parts = []
+    tables = []
     for environment, group in _environments(drives).items():
         base = _own(group)
         for drive in group:
-            about = {"environment": environment, "case": drive.case, "run": drive.run}
-            about |= {"step": range(1, len(drive.time_s) + 1), "time_s": drive.time_s}
-            about["control"] = drive.first_controls
-            about["change"] = drive.first_controls - base.first_controls
-            parts.append(pd.DataFrame(about))
-    write_csv(output / "controls.csv", pd.concat(parts))
+            columns = {"environment": environment, "case": drive.case, "run": drive.run}
+            columns |= {"step": range(1, len(drive.time_s) + 1), "time_s": drive.time_s}
+            columns["control"] = drive.first_controls
+            columns["change"] = drive.first_controls - base.first_controls
+            tables.append(pd.DataFrame(columns))
+    write_csv(output / "controls.csv", pd.concat(tables))
 
 
 def plot_control_changes(output: Path, drives: Sequence[Drive], unit: str) -> None:
@@ -99,10 +99,10 @@ def plot_control_changes(output: Path, drives: Sequence[Drive], unit: str) -> No
 
 
 def _environments(drives: Sequence[Drive]) -> dict[str, list[Drive]]:
-    found: dict[str, list[Drive]] = {}
+    groups: dict[str, list[Drive]] = {}
     for drive in drives:
-        found.setdefault(drive.environment, []).append(drive)
-    return found
+        groups.setdefault(drive.environment, []).append(drive)
+    return groups
 
 
 def _own(group: Sequence[Drive]) -> Drive:
@@ -154,44 +154,44 @@ def attribute(
     total = rollout.gradient(evaluation, on_step=on_step)
     textures = [texture.numpy().copy() for texture in total.textures]
     recorder = StepRecorder(textures)
-    parts = rollout.gradient(evaluation, recorder=recorder, on_step=on_step)
-    assert parts.attribution is not None, "asked for by the recorder"
+    by_period = rollout.gradient(evaluation, recorder=recorder, on_step=on_step)
+    assert by_period.attribution is not None, "asked for by the recorder"
     drive = evaluation.trajectory
     states = drive.states_numpy()[:, 1:]
     error = [route.cross_track_numpy(vehicle) for vehicle in states]
     times = TimeAttribution(
         drive.dt * np.arange(1, drive.horizon + 1),
         total.costates,
-        parts.attribution.along,
+        by_period.attribution.along,
         np.stack(error, axis=1),
         limit_m,
         list(objects),
     )
     subject = "gradient" if attack.freedom.texture_rate is not None else UNCHANGED
-    return FailureAttribution(times, parts.attribution.norms, textures, subject)
+    return FailureAttribution(times, by_period.attribution.norms, textures, subject)
 
 
 def write_attribution(
-    folder: Path, found: FailureAttribution, fields: Sequence[GridField]
+    folder: Path, attribution: FailureAttribution, fields: Sequence[GridField]
 ) -> None:
     """Write ``attribution.json``, ``attribution.png``, ``attribution_object.png``.
 
     Args:
         folder: the run folder.
-        found: from :func:`attribute`.
+        attribution: from :func:`attribute`.
         fields: the objects, with the textures that are to be seen.
     """
-    times = found.times
+    times = attribution.times
     data = {
         "time_s": times.time_s.tolist(),
         "costates": times.costates.tolist(),
         "cross_track_m": times.cross_track_m.tolist(),
-        "gradient_norm": _columns(times.objects, found.norms),
+        "gradient_norm": _columns(times.objects, attribution.norms),
         "gradient_share": _columns(times.objects, times.shares),
     }
     files.write_json(folder / ATTRIBUTION, data)
-    plot_attribution(folder / "attribution.png", times, found.subject)
-    pairs = zip(times.objects, fields, found.textures, strict=True)
+    plot_attribution(folder / "attribution.png", times, attribution.subject)
+    pairs = zip(times.objects, fields, attribution.textures, strict=True)
     sides = {name: side_views(grid, g) for name, grid, g in pairs}
     write_heat(folder / "attribution_object.png", sides)
 

@@ -106,27 +106,27 @@ class Judgements(AbstractWork):
         folder: of the files.
         identity: of the run.
         scenario: of the run.
-        here: the judge of this process; another process builds a judge.
+        local_judge: the judge of this process; another process builds a judge.
     """
 
     folder: Path
     identity: Mapping[str, str]
     scenario: Scenario
-    here: Judge | None
+    local_judge: Judge | None
 
     def open(self) -> Judge:
         """Build world and attack, unless they are there."""
-        if self.here is not None:
-            return self.here
+        if self.local_judge is not None:
+            return self.local_judge
         world = build_world(self.scenario, self.scenario.build_policy())
         return Judge(world, build_attack(world), world.appearance())
 
     def do(self, opened: Judge, index: int, report: OnUnits) -> None:
         """Judge one appearance; a unit is a control period."""
         with one_thread():
-            found = opened.judge(index, lambda step: report(1))
+            judgement = opened.judge(index, lambda step: report(1))
         files.make_folder(self.folder)
-        self._unit(index).write({}, found)
+        self._unit(index).write({}, judgement)
 
     def close(self, opened: Judge) -> None:
         """Let go of nothing."""
@@ -134,14 +134,14 @@ class Judgements(AbstractWork):
 
     def read(self, number: int) -> Judged | None:
         """Read the judgement of an appearance; None where there is none."""
-        kept = self._unit(number).read()
-        return None if kept is None else kept.record
+        stored = self._unit(number).read()
+        return None if stored is None else stored.record
 
     def remove_others(self, count: int) -> None:
         """Remove files of other runs in the folder, and of further appearances."""
-        wanted = {self._unit(number).path for number in range(count)}
+        expected = {self._unit(number).path for number in range(count)}
         for path in self.folder.glob("*.safetensors"):
-            if path not in wanted:
+            if path not in expected:
                 path.unlink()
 
     def _unit(self, number: int) -> Unit[Judged]:
@@ -151,7 +151,7 @@ class Judgements(AbstractWork):
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the judge behind, whose world no process can send."""
-        return {**self.__dict__, "here": None}
+        return {**self.__dict__, "local_judge": None}
 
 
 @dataclass
@@ -236,9 +236,9 @@ class Baseline:
         self.objectives = [self._read(work, number).objective for number in numbers]
 
     def _read(self, work: Judgements, number: int) -> Judged:
-        if (found := work.read(number)) is None:
+        if (judgement := work.read(number)) is None:
             raise InputError(f"{work.folder}: look {number} is missing; it was removed")
-        return found
+        return judgement
 
     @property
     def best(self) -> int:

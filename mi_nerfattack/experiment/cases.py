@@ -116,7 +116,7 @@ class CaseDriver(AbstractDriver):
 
     def drive(self, spec: DriveSpec, on_step: OnStep) -> Drive:
         """Drive once."""
-        world, shown, label = self._world, spec.how, spec.environment
+        world, shown, label = self._world, spec.context, spec.environment
         look, empty = shown.look, shown.look is None
         if not empty:
             world.show(look if isinstance(look, Appearance) else self._looks(look))
@@ -217,16 +217,16 @@ class Cases:
     def one(self, label: str, case: str, run: int) -> Drive:
         """Return one of the drives of a case, which is then kept."""
         spec = self._spec(label, case, run, self.looks[case])
-        if (kept := self.store.read(spec)) is not None:
-            return kept.drive
+        if (stored := self.store.read(spec)) is not None:
+            return stored.drive
         if self._driver is None:
             looks = RandomAppearances.of(self.world, self.own)
             self._driver = CaseDriver(self.world, looks)
         on_step = step_counter(self.on_progress, f"{label}: {case}", spec.steps)
         count = self.counter()
-        found = self._work([spec]).drive(self._driver, spec, on_step)
-        count(len(found.states))
-        return found
+        driven = self._work([spec]).drive(self._driver, spec, on_step)
+        count(len(driven.states))
+        return driven
 
     def drive(
         self, specs: Sequence[DriveSpec], workers: AbstractWorkers
@@ -240,30 +240,30 @@ class Cases:
         self.close()
         is_first, count = True, self.counter()
 
-        def on_groups(found: Groups) -> None:
+        def on_groups(groups: Groups) -> None:
             nonlocal is_first
             if not is_first:  # the first are those that were there
-                for [item] in found.values():
+                for [item] in groups.values():
                     count(len(item.drive.states))
             is_first = False
 
         def progress(done: int, total: int) -> None:
             self.on_progress("drives", done, total, "")
 
-        found = run_drives(self._work(specs), workers, progress, on_groups)
-        return [item.drive for [item] in found]
+        finished_groups = run_drives(self._work(specs), workers, progress, on_groups)
+        return [item.drive for [item] in finished_groups]
 
     def counter(self) -> Callable[[int], None]:
         """Return what counts the frames of work that begins now.
 
         The world's sensors count those that they render, in this process.
         """
-        seen = self.world.renders
+        renders_before = self.world.renders
 
         def count(frames: int) -> None:
-            nonlocal seen
-            self.renders += frames - (self.world.renders - seen)
-            seen = self.world.renders
+            nonlocal renders_before
+            self.renders += frames - (self.world.renders - renders_before)
+            renders_before = self.world.renders
             self.on_drives()
 
         return count
@@ -293,7 +293,7 @@ class Cases:
             seed=seed,
             steps=world.horizon,
             identity=self._shared(label) | flatten("drive", decided),
-            how=Shown(start, look, digest),
+            context=Shown(start, look, digest),
         )
 
     def _digest(self, look: Appearance | int) -> str:
@@ -322,9 +322,9 @@ def shared_identity(
         identity: of its scenario, see :meth:`Scenario.identity`.
         label: of the environment.
     """
-    name, section, here = None, {}, label == SURROGATE
-    if not here:
+    name, section, in_surrogate = None, {}, label == SURROGATE
+    if not in_surrogate:
         name = world.deployments[label].environment
         section = section_content(dict(labelled(world.scenario.deployment))[label])
-    found = decisive(world.scenario, identity, here)
-    return identify(name, found | flatten("deployment", section))
+    shared = decisive(world.scenario, identity, in_surrogate)
+    return identify(name, shared | flatten("deployment", section))

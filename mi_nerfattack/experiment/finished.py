@@ -100,17 +100,17 @@ class Finished:
         Neither the reduction over poses nor penalties on textures are in it. None where
         it has no value, of which `uncosted` says why.
         """
-        found = self._costs_or_reasons.items()
-        return {k: None if isinstance(v, str) else v for k, v in found}
+        pairs = self._costs_or_reasons.items()
+        return {k: None if isinstance(v, str) else v for k, v in pairs}
 
     @cached_property
     def uncosted(self) -> dict[str, str]:
         """Environments in which the objective of a drive has no value, and why."""
-        found = dict(self._other_models)
+        reasons = dict(self._other_models)
         for drive, reason in self._costs_or_reasons.items():
             if isinstance(reason, str):
-                found.setdefault(drive.environment, reason)
-        return found
+                reasons.setdefault(drive.environment, reason)
+        return reasons
 
     @cached_property
     def _costs_or_reasons(self) -> dict[Drive, float | str]:

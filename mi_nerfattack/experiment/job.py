@@ -17,13 +17,10 @@ from mi_nerfattack.backend.determinism import deterministic, one_thread
 from mi_nerfattack.backend.interrupts import held_interrupts
 from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.drives.spec import DriveSpec
-from mi_nerfattack.errors import InputError, RefusedError
+from mi_nerfattack.errors import InputError, RefusedError, is_of_disk
 from mi_nerfattack.experiment.baseline import Baseline, Judge, Judgements
 from mi_nerfattack.experiment.cases import Cases, OnProgress, step_counter
-from mi_nerfattack.experiment.checks.before_attack import (
-    first_findings,
-    further_findings,
-)
+from mi_nerfattack.experiment.checks import before_attack
 from mi_nerfattack.experiment.claim import LOOKS, claimed
 from mi_nerfattack.experiment.finished import Finished, Frames, Run
 from mi_nerfattack.experiment.run_folder import Account, Effort, RunFolder
@@ -59,13 +56,6 @@ _JUDGED_BY = ("attack.method.kind", "attack.method.frame", "baseline.kind")
 def quiet(*arguments: Any) -> None:
     """Show nothing of what is reported."""
     del arguments
-
-
-def _is_of_disk(error: BaseException | None) -> bool:
-    """Tell an error that no other scenario mends, such as a full disk."""
-    while error is not None and not isinstance(error, OSError):
-        error = error.__cause__
-    return error is not None
 
 
 @dataclass
@@ -139,7 +129,7 @@ class Job:
                 account = Account(self.started, folder.effort)
                 return self._work(world, folder, account, described, anyway)
             except InputError as err:
-                if not _is_of_disk(err):
+                if not is_of_disk(err):
                     folder.withdraw()
                 raise
 
@@ -181,8 +171,9 @@ class Job:
             baseline.figures(),
             flags,
         )
-        how = self.on_progress, self.on_notice, self.frames
-        return results.write_results(self.output, done, effort, *how)
+        return results.write_results(
+            self.output, done, effort, self.on_progress, self.on_notice, self.frames
+        )
 
     def _judge(self, baseline: Baseline, folder: RunFolder, cases: Cases) -> None:
         """Judge random looks, and find the best."""
@@ -218,7 +209,7 @@ class Job:
         if folder.checkpoint.flags is not None:
             return folder.checkpoint.flags
         flags: list[str] = []
-        for check in (first_findings, further_findings):
+        for check in (before_attack.first_findings, before_attack.further_findings):
             flags += check(world, cases.one)
             if flags and not anyway:
                 listed = "\n".join(f"  {line}" for line in flags)
@@ -241,7 +232,7 @@ class Job:
         """Do the iterations that are missing; whatever stops them, keep those done."""
         attack = build_attack(world)
         section, checkpoint = self.scenario.attack, folder.checkpoint
-        if checkpoint.found:
+        if checkpoint.is_loaded:
             checkpoint.restore(attack)
         if not attack.best_is_judged:
             stage = "surrogate: best so far"
@@ -258,7 +249,7 @@ class Job:
                     check()
         finally:
             done = attack.iteration > checkpoint.iteration
-            if done and attack.whole and not checkpoint.failed:
+            if done and attack.is_consistent and not checkpoint.failed:
                 checkpoint.save(attack)
                 save()
         attack.finish()
@@ -394,7 +385,15 @@ def attack_claimed(
             "steps; give 1"
         )
     with one_thread():
-        reports = on_progress, on_notice
-        job = Job(described, text, policy, folder, *reports, started, frames)
-        job.workers = chosen_workers(workers, alone or has_server)
+        job = Job(
+            described,
+            text,
+            policy,
+            output=folder,
+            on_progress=on_progress,
+            on_notice=on_notice,
+            started=started,
+            frames=frames,
+            workers=chosen_workers(workers, alone or has_server),
+        )
         return job.run_claimed(force, anyway)

@@ -25,7 +25,7 @@ from mi_nerfattack.vehicle.route.route import Route
 from mi_nerfattack.vehicle.steering import steering_angle
 
 #: Share of the stretch from which on a drive counts as whole.
-WHOLE = 0.95
+MIN_SHARE = 0.95
 _FAR = 3.0  # lane widths: another frame of the world
 _STANDING = 0.1  # of the route's speed
 
@@ -57,18 +57,27 @@ class Course:
     wheelbase: float
 
     @classmethod
-    def of(cls, found: FoundAttack) -> Course:
+    def of(cls, attack: FoundAttack) -> Course:
         """Return that of a run."""
-        scenario, route = found.scenario, found.route
+        scenario, route = attack.scenario, attack.route
         rig = scenario.rig()
-        rig.require_one(f"{found.folder}", "recordings show one camera's images")
+        rig.require_one(f"{attack.folder}", "recordings show one camera's images")
         camera, mount = rig.cameras[0], rig.mounts[0]
         if scenario.scene.surrogate is not None:
             camera = build_surrogate(scenario).intrinsics
         period, car = scenario.vehicle.dt_s, scenario.vehicle.car()
-        stretch = scenario.drive.stretch(route, period)
-        rest = camera, mount, period, car.control_unit, car.wheelbase
-        return cls(route, *stretch, found.lane, *rest)
+        start_m, end_m = scenario.drive.stretch(route, period)
+        return cls(
+            route,
+            start_m,
+            end_m,
+            lane=attack.lane,
+            camera=camera,
+            mount=mount,
+            period=period,
+            control_unit=car.control_unit,
+            wheelbase=car.wheelbase,
+        )
 
     @property
     def length_m(self) -> float:
@@ -142,7 +151,7 @@ class RealDrive:
     @property
     def is_whole(self) -> bool:
         """Whether it went all the way, or as far and out of the lane."""
-        return self.coverage >= WHOLE or (self.is_out and self.driven >= WHOLE)
+        return self.coverage >= MIN_SHARE or (self.is_out and self.driven >= MIN_SHARE)
 
 
 def read_all(
@@ -274,7 +283,7 @@ def _cut(
 
 
 def real_document(
-    found: FoundAttack,
+    attack: FoundAttack,
     course: Course,
     of_run: Sequence[Drive],
     drives: Sequence[RealDrive],
@@ -283,7 +292,7 @@ def real_document(
     """Return the document of a run with the real drives among its own.
 
     Args:
-        found: the run.
+        attack: the run.
         course: of the run.
         of_run: drives of the run.
         drives: from :func:`read_all`; may be none.
@@ -296,9 +305,9 @@ def real_document(
     Raises:
         InputError: the run has no drives.
     """
-    run = read_finished(found.folder)
+    run = read_finished(attack.folder)
     if not of_run:
-        raise InputError(f"{found.folder}: no drives to compare with; attack again")
+        raise InputError(f"{attack.folder}: no drives to compare with; attack again")
     everything = [*of_run, *(item.drive for item in drives)]
     lanes = {course.route.name: course.lane}
     document = metrics_document(

@@ -23,7 +23,7 @@ from mi_nerfattack.experiment.pictures.write import write_images
 from mi_nerfattack.experiment.run_folder import METRICS, Effort, object_path
 from mi_nerfattack.fields import save_field
 from mi_nerfattack.io import files
-from mi_nerfattack.report.pages.elements import Parts
+from mi_nerfattack.report.pages.elements import PageContents
 from mi_nerfattack.report.pages.results import write_results_page
 from mi_nerfattack.rollout.drive import ATTACK, OWN, Drive
 from mi_nerfattack.scenario.deployment import SURROGATE
@@ -58,7 +58,7 @@ def texture_figures(
     camera = world.surrogate.intrinsics
     # A colour's sigmoid rises by a quarter there, in each channel of a pixel it fills.
     filled = 3 / 4 * camera.width * camera.height * len(states)
-    found = {
+    textures = {
         item.id: asdict(texture_statistics(field, original, weight))
         | {"picture_share": float(np.clip(weight.sum() / filled, 0, 1))}
         for item, field, original, weight in zip(
@@ -67,10 +67,10 @@ def texture_figures(
     }
     names = ("saturated_share", "total_variation")
     means = {
-        name: float(np.mean([figures[name] for figures in found.values()]))
+        name: float(np.mean([figures[name] for figures in textures.values()]))
         for name in names
     }
-    return {"textures": found, **means}
+    return {"textures": textures, **means}
 
 
 def write_results(
@@ -106,8 +106,10 @@ def write_results(
         write_images(output, done, history, frames, on_progress)
         document["cost"] = effort().model_dump()
         files.write_json(path, document)
-        parts = Parts(runs=[read_run(output, output.name)])
-        write_results_page(output / "report.html", document["scenario"]["name"], parts)
+        contents = PageContents(runs=[read_run(output, output.name)])
+        write_results_page(
+            output / "report.html", document["scenario"]["name"], contents
+        )
     except BaseException:
         on_notice(
             f"{path}: holds all figures; pictures are missing: make room if the disk "
@@ -136,33 +138,33 @@ def _describe(done: Finished, effort: Callable[[], Effort]) -> dict[str, Any]:
     """Return the document that ``metrics.json`` holds."""
     world, scenario = done.world, done.world.scenario
     lanes = {world.route.name: done.lane}
-    more: dict[str, Any] = {"baseline": done.baseline}
+    sections: dict[str, Any] = {"baseline": done.baseline}
     if not scenario.objective.is_lane_distance:
         name = scenario.objective.name
-        more["objective"] = {"name": name, "missing": done.uncosted}
+        sections["objective"] = {"name": name, "missing": done.uncosted}
     if replayed := done.replayed:
         unit = scenario.vehicle.car().control_unit
-        more["replay"] = control_changes(replayed, unit, scenario.seed)
+        sections["replay"] = control_changes(replayed, unit, scenario.seed)
     if done.attack.freedom.pose_rate is not None:
-        more["object_poses"] = _poses(world, done.look(ATTACK))
+        sections["object_poses"] = _poses(world, done.look(ATTACK))
     if done.ignored:
-        more["ignored_changes"] = done.ignored
+        sections["ignored_changes"] = done.ignored
     if (curve := done.curve) is not None:
-        more["curve"] = curve
-    more["converged"] = done.attack.has_converged
+        sections["curve"] = curve
+    sections["converged"] = done.attack.has_converged
     if (gain := done.attack.least_gain) is not None and not done.ignored:
-        more["least_gain"] = gain
+        sections["least_gain"] = gain
     bricks, one_level = scenario.scene.bricks, done.attack.one_level
     if bricks is not None or one_level:
         means = _optimised_and_exact(done)
-        more |= {"bricks": {"file": str(bricks), **means}} if bricks else {}
-        more |= {"one_level": means} if one_level else {}
-    more |= texture_figures(world, done.drives, done.look(OWN), done.look(ATTACK))
+        sections |= {"bricks": {"file": str(bricks), **means}} if bricks else {}
+        sections |= {"one_level": means} if one_level else {}
+    sections |= texture_figures(world, done.drives, done.look(OWN), done.look(ATTACK))
     values, cost = scenario.model_dump(mode="json"), effort().model_dump()
     document = metrics_document(
         values, scenario.seed, done.driven, lanes, cost, done.costs
     )
-    document |= more
+    document |= sections
     attack, names = done.attack, [item.id for item in scenario.objects]
     without = [names[index] for index in attack.without_gradient]
     document["flags"] = [

@@ -16,11 +16,11 @@ from mi_nerfattack.evaluation.metrics import validate
 from mi_nerfattack.experiment.claim import CHECKPOINT, DRIVES, EFFORT, SCENARIO
 from mi_nerfattack.io import files, locks
 from mi_nerfattack.io.resumable import (
-    Kept,
     Record,
     Unit,
+    UnitContent,
     check_entries,
-    misfits_told,
+    misfits_reported,
 )
 from mi_nerfattack.system.machine import peak_memory_mb, peak_of_children_mb
 
@@ -71,7 +71,7 @@ class CheckpointFile:
         self.failed = False
         self.ignored: list[str] = []
         self.flags: list[str] | None = None
-        self._kept: Kept[CheckpointRecord] | None = None
+        self._checkpoint: UnitContent[CheckpointRecord] | None = None
 
     def read(self, force: bool = False) -> None:
         """Read and check the file, where there is one, for :meth:`restore`.
@@ -83,16 +83,16 @@ class CheckpointFile:
             InputError: the file is damaged, no checkpoint, or belongs to another
                 scenario or other versions.
         """
-        self._kept = self._unit.read(force)
-        if self._kept is not None:
-            self.ignored = [*self._kept.record.ignored, *self._kept.ignored]
-            if not self._kept.ignored:
-                self.flags = self._kept.record.flags
+        self._checkpoint = self._unit.read(force)
+        if self._checkpoint is not None:
+            self.ignored = [*self._checkpoint.record.ignored, *self._checkpoint.ignored]
+            if not self._checkpoint.ignored:
+                self.flags = self._checkpoint.record.flags
 
     @property
-    def found(self) -> bool:
+    def is_loaded(self) -> bool:
         """Whether :meth:`read` found a checkpoint."""
-        return self._kept is not None
+        return self._checkpoint is not None
 
     def restore(self, attack: AbstractAttack) -> None:
         """Give an attack the state that was read, which is forgotten here.
@@ -103,20 +103,22 @@ class CheckpointFile:
         Raises:
             InputError: an entry does not fit the objects.
         """
-        kept, self._kept = self._kept, None
-        assert kept is not None, "read() has found a checkpoint"
+        checkpoint, self._checkpoint = self._checkpoint, None
+        assert checkpoint is not None, "read() has found a checkpoint"
         needed = attack.tensors() | random_states()
-        if kept.ignored:  # of another scenario: without what this one adds
-            needed = {name: needed[name] for name in needed if name in kept.tensors}
-        check_entries(self.path, kept.tensors, needed)
-        with misfits_told(self.path):
-            if kept.ignored:
-                attack.go_on_from(kept.tensors)
+        if checkpoint.ignored:  # of another scenario: without what this one adds
+            needed = {
+                name: needed[name] for name in needed if name in checkpoint.tensors
+            }
+        check_entries(self.path, checkpoint.tensors, needed)
+        with misfits_reported(self.path):
+            if checkpoint.ignored:
+                attack.go_on_from(checkpoint.tensors)
             else:
-                attack.load_tensors(kept.tensors)
-            restore_random_states(kept.tensors)
+                attack.load_tensors(checkpoint.tensors)
+            restore_random_states(checkpoint.tensors)
         self.iteration = attack.iteration
-        if kept.ignored:
+        if checkpoint.ignored:
             self.save(attack)
 
     def save(self, attack: AbstractAttack) -> None:
@@ -141,13 +143,13 @@ class CheckpointFile:
         self.seconds += time.perf_counter() - start
 
     def _advice(self, attack: AbstractAttack) -> str:
-        kept = (
+        status = (
             f"the checkpoint of iteration {self.iteration} is intact"
             if self.iteration
             else "there is no checkpoint yet"
         )
         return (
-            f"iteration {attack.iteration} is not saved, {kept}; the same command "
+            f"iteration {attack.iteration} is not saved, {status}; the same command "
             "continues"
         )
 
@@ -305,9 +307,9 @@ class RunFolder:
         """
         is_new = not (self.checkpoint.path.exists() or self.drives.folder.exists())
         self.checkpoint.read(force)
-        kept, ignored = self._effort.read(force), self.checkpoint.ignored
-        if kept is not None:
-            self.effort, ignored = kept.record, [*ignored, *kept.ignored]
+        stored, ignored = self._effort.read(force), self.checkpoint.ignored
+        if stored is not None:
+            self.effort, ignored = stored.record, [*ignored, *stored.ignored]
         elif is_new:
             self._check_scenario(force, on_notice)
         for line in dict.fromkeys(ignored):

@@ -241,9 +241,9 @@ def flat_parameter(value: Any, shape: tuple[int, ...], name: str) -> mi.Float:
     """
     if value is None:
         value = np.zeros(shape, np.float32)
-    found = tuple(value.shape)
-    if found not in (shape, (int(np.prod(shape)),)):
-        raise InputError(f"{name}: shape {found}; expected {shape}")
+    value_shape = tuple(value.shape)
+    if value_shape not in (shape, (int(np.prod(shape)),)):
+        raise InputError(f"{name}: shape {value_shape}; expected {shape}")
     if isinstance(value, np.ndarray):
         flat = upload(mi.Float, value)
     else:

@@ -94,13 +94,13 @@ def _read_spz(path: str | Path) -> Splats:
         )
     ends = 16 + count * np.cumsum([0, *sizes])
     data = np.frombuffer(raw, np.uint8)
-    at, alphas, colours, scales, turns, rest = (
+    at, alphas, colours, scales, turns, term_bytes = (
         data[begin:end].reshape(count, size)
         for begin, end, size in zip(ends[:-1], ends[1:], sizes, strict=True)
     )
     harmonics = np.empty((count, 1 + terms, 3))
     harmonics[:, 0] = (colours / 255 - 0.5) / 0.15
-    coefficients = (rest.reshape(count, terms, 3) - 128.0) / 128
+    coefficients = (term_bytes.reshape(count, terms, 3) - 128.0) / 128
     harmonics[:, 1:] = coefficients * _TURNED[:terms, None]
     quaternions = _first_three(turns) if version == 2 else _smallest_three(turns)
     quaternions[:, 1:] *= _TURN
@@ -117,7 +117,7 @@ def _read_spz(path: str | Path) -> Splats:
 def _decompress(path: str | Path, raw: bytes) -> bytes:
     stream = zlib.decompressobj(16 + zlib.MAX_WBITS)  # of gzip
     try:
-        found = stream.decompress(raw, MAX_BYTES)
+        contents = stream.decompress(raw, MAX_BYTES)
     except zlib.error as err:
         raise InputError(f"{path}: {err}; damaged: copy or export it again") from err
     if not stream.eof:
@@ -125,32 +125,32 @@ def _decompress(path: str | Path, raw: bytes) -> bytes:
             f"{path}: ends early, or holds more than {MAX_BYTES >> 30} GiB; copy or "
             "export it again"
         )
-    return found
+    return contents
 
 
-def _fixed(parts: np.ndarray) -> np.ndarray:
+def _fixed(octets: np.ndarray) -> np.ndarray:
     """Return signed numbers of 24 bits, the lowest byte first, (n, 3)."""
-    low, middle, high = (parts[..., k].astype(np.int32) for k in range(3))
+    low, middle, high = (octets[..., k].astype(np.int32) for k in range(3))
     return low | middle << 8 | high.astype(np.int8).astype(np.int32) << 16
 
 
-def _first_three(parts: np.ndarray) -> np.ndarray:
+def _first_three(octets: np.ndarray) -> np.ndarray:
     """Return quaternions w, x, y, z, of whose x, y, z each has a byte."""
-    vector = parts / 127.5 - 1
+    vector = octets / 127.5 - 1
     real = np.sqrt(np.maximum(1 - (vector**2).sum(1, keepdims=True), 0))
     return np.concatenate([real, vector], 1)
 
 
-def _smallest_three(parts: np.ndarray) -> np.ndarray:
+def _smallest_three(octets: np.ndarray) -> np.ndarray:
     """Return quaternions w, x, y, z, of which all but the largest have 10 bits."""
-    word = np.ascontiguousarray(parts).view("<u4")[:, 0]
+    word = np.ascontiguousarray(octets).view("<u4")[:, 0]
     largest = word >> 30
     result = np.zeros((len(word), 4))  # x, y, z, w
     for index in (3, 2, 1, 0):
-        here = largest != index
+        stored = largest != index
         value = (word & 511) / 511 * np.sqrt(0.5) * np.where(word & 512, -1, 1)
-        result[here, index] = value[here]
-        word = np.where(here, word >> 10, word)
-    rest = np.sqrt(np.maximum(1 - (result**2).sum(1), 0))
-    result[np.arange(len(word)), largest] = rest
+        result[stored, index] = value[stored]
+        word = np.where(stored, word >> 10, word)
+    magnitude = np.sqrt(np.maximum(1 - (result**2).sum(1), 0))
+    result[np.arange(len(word)), largest] = magnitude
     return result[:, [3, 0, 1, 2]]

@@ -86,8 +86,13 @@ class GridLayout:
 
     @property
     def _laid_out(self) -> tuple[list[GridLevel], int]:
-        resolutions = self.base_resolution, self.max_resolution
-        return lay_out_levels(self.levels, *resolutions, 4, self.hashmap_size)
+        return lay_out_levels(
+            self.levels,
+            self.base_resolution,
+            self.max_resolution,
+            features=4,
+            most=self.hashmap_size,
+        )
 
 
 class GridField(AbstractField):
@@ -142,7 +147,7 @@ class GridField(AbstractField):
         check_positive("density_scale", self.density_scale)
         self.info: dict[str, str] = dict(info or {})
         self._marched: OneLevel | None = None  # in place of all levels
-        self._kept: OneLevel | None = None  # from the last time
+        self._cached_level: OneLevel | None = None  # from the last time
         self.occupy(occupancy or Occupancy.full())
         self.encoding: HashGridEncoding = HashGridEncoding(
             mi.Float,
@@ -169,7 +174,7 @@ class GridField(AbstractField):
         self.refuse_one_level("occupy")
         super().occupy(occupancy)
         self._bound: float | None = None
-        self._kept = None
+        self._cached_level = None
 
     @property
     def texture(self) -> mi.TensorXf:
@@ -204,11 +209,11 @@ class GridField(AbstractField):
         self.refuse_one_level("one_level")
         if not self.window.cells.any():
             raise InputError("one_level: no cell of the grid field is occupied")
-        if self._kept is None or self._kept.level != level:
+        if self._cached_level is None or self._cached_level.level != level:
             finest = self.levels()[-1]
-            self._kept = OneLevel(finest, level, self.window.cells)
+            self._cached_level = OneLevel(finest, level, self.window.cells)
         try:
-            self._marched = self._kept
+            self._marched = self._cached_level
             self._pack()
             yield
         finally:
@@ -284,11 +289,11 @@ class GridField(AbstractField):
         before = self.encoding.data
         self.encoding.data = self.pack(texture)
         try:
-            found = [mi.Float(x) for x in self._sum_levels(unit, mi.Bool(True))]
-            dr.eval(found)
+            totals = [mi.Float(x) for x in self._sum_levels(unit, mi.Bool(True))]
+            dr.eval(totals)
         finally:
             self.encoding.data = before
-        return found
+        return totals
 
     def _sum_levels(self, unit: mi.Point3f, active: mi.Bool) -> list[Any]:
         features = self.encoding(unit, active)
@@ -355,7 +360,7 @@ class GridField(AbstractField):
             self.refuse_one_level("density")
             value = flat_parameter(value, (self.n_vertices,), name)
             mi.set_property(self._density, value)
-            self._bound = self._kept = None
+            self._bound = self._cached_level = None
         else:
             raise KeyError(
                 f"{name}: a grid field has 'texture', 'colour' and 'density'"

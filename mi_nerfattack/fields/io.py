@@ -151,9 +151,10 @@ def _bricks(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> Brick
     if len(codes) != len(fields(Codes)):
         raise ValueError(f"log_density: {len(codes)} numbers; expected low and high")
     cells, octants = _cells(tensors, meta)
-    bricks = [tensors[name] for name in ("subdivisions", "vertices", "sky")]
-    check_bricks(int(cells.sum()), *bricks)  # before the occupancy takes memory
-    subdivisions, vertices, sky = bricks
+    names = "subdivisions", "vertices", "sky"
+    subdivisions, vertices, sky = (tensors[name] for name in names)
+    # before the occupancy takes memory
+    check_bricks(int(cells.sum()), subdivisions, vertices, sky=sky)
     return BrickField(
         _vector(meta, "lower"),
         _vector(meta, "upper"),
@@ -197,14 +198,14 @@ def _cells(
     cells = np.unpackbits(bits, count=count).view(bool).reshape(shape)
     if "octants" not in tensors:
         return cells, None
-    given = tensors["octants"]
-    if given.shape != (cells.sum(),) or given.dtype != np.uint8:
+    octant_bytes = tensors["octants"]
+    if octant_bytes.shape != (cells.sum(),) or octant_bytes.dtype != np.uint8:
         raise ValueError(
-            f"octants: {given.dtype} {given.shape} for {cells.sum()} occupied cells; "
-            "expected a byte each, the file is damaged"
+            f"octants: {octant_bytes.dtype} {octant_bytes.shape} for {cells.sum()} "
+            "occupied cells; expected a byte each, the file is damaged"
         )
     octants = np.zeros(shape, np.uint8)
-    octants[cells] = given
+    octants[cells] = octant_bytes
     return cells, octants
 
 

@@ -87,9 +87,14 @@ class NGPLayout:
     @property
     def n_params(self) -> int:
         """Number of values in the hash grid's table."""
-        resolutions = self.base_resolution, self.max_resolution
-        sizes = self.features, 2**self.log2_table
-        return self.features * lay_out_levels(self.levels, *resolutions, *sizes)[1]
+        _, n_vertices = lay_out_levels(
+            self.levels,
+            self.base_resolution,
+            self.max_resolution,
+            features=self.features,
+            most=2**self.log2_table,
+        )
+        return self.features * n_vertices
 
     def check(self, tensors: Mapping[str, np.ndarray]) -> None:
         """Raise InputError unless the tensors of a file have this layout's shapes.

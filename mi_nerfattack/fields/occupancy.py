@@ -41,15 +41,15 @@ class Occupancy:
         self.octants: np.ndarray | None = (
             None if octants is None else octants * self.cells
         )
-        seen = self.cells if self.octants is None else self.octants > 0
-        if seen.all():
+        occupied = self.cells if self.octants is None else self.octants > 0
+        if occupied.all():
             distance = np.zeros(self.shape, np.uint8)
-        elif not seen.any():
+        elif not occupied.any():
             distance = np.full(self.shape, MAX_DISTANCE, np.uint8)
         else:
             from scipy import ndimage  # slow to import
 
-            far: Any = ndimage.distance_transform_cdt(~seen, metric="chessboard")
+            far: Any = ndimage.distance_transform_cdt(~occupied, metric="chessboard")
             distance = np.minimum(far, MAX_DISTANCE).astype(np.uint8)
         if self.octants is None:
             words = np.pad(distance.ravel(), (0, -distance.size % 4)).view("<u4")
@@ -79,8 +79,8 @@ class Occupancy:
         if not self.cells.any():
             raise InputError("field: no cell is occupied; make the field again")
         sides = [self.cells.any(axis) for axis in ((1, 2), (0, 2), (0, 1))]
-        found = [np.flatnonzero(side)[[0, -1]] + [0, 1] for side in sides]
-        return np.transpose(found) / self.shape
+        extents = [np.flatnonzero(side)[[0, -1]] + [0, 1] for side in sides]
+        return np.transpose(extents) / self.shape
 
     def query(self, unit: mi.Point3f, active: mi.Bool) -> tuple[mi.Float, mi.Point3f]:
         """Look up the distance grid.

@@ -82,8 +82,8 @@ class OneLevel:
             if one == other:  # the same memory
                 return
             if not is_same_beside(self.level, texture, self._summed):
-                rest = without(self.level, texture)
-                self._others = dr.ravel(mi.Vector4f(*sums(self._points, rest)))
+                masked = without(self.level, texture)
+                self._others = dr.ravel(mi.Vector4f(*sums(self._points, masked)))
                 self._summed = texture
             colours = colours_of(self.level, texture)
             total = mi.Vector3f(0)
@@ -161,17 +161,17 @@ def _lattice(
         of the v vertices these have, x the fastest, (m, 8); and where the vertices lie,
         from 0 to `count`, (v, 3).
     """
-    kept = occupied
+    mask = occupied
     for axis, size in enumerate(occupied.shape):
         edges = np.arange(count + 1) * size / count
         first = np.floor(edges[:-1] - 1e-3).clip(0, size - 1).astype(int)
         stop = np.floor(edges[1:] + 1e-3).clip(0, size - 1).astype(int) + 1
-        rows = any_of(np.moveaxis(kept, axis, 0), first, stop)
-        kept = np.moveaxis(rows, 0, axis)
-    kept = kept.T  # z first, so that x is the fastest
-    blocks = np.zeros(kept.shape, np.uint32)
-    blocks[kept] = np.arange(np.count_nonzero(kept))
-    cells = np.argwhere(kept).astype(np.int32)
+        rows = any_of(np.moveaxis(mask, axis, 0), first, stop)
+        mask = np.moveaxis(rows, 0, axis)
+    mask = mask.T  # z first, so that x is the fastest
+    blocks = np.zeros(mask.shape, np.uint32)
+    blocks[mask] = np.arange(np.count_nonzero(mask))
+    cells = np.argwhere(mask).astype(np.int32)
     steps = [np.array([k >> 2, k >> 1 & 1, k & 1], np.int32) for k in range(8)]
     numbers = np.zeros((count + 1,) * 3, np.uint32)
     for step in steps:

@@ -181,19 +181,19 @@ def _check_present(path: str | Path, present: list[str]) -> None:
             + (f", and {len(missing) - 1} more" if len(missing) > 1 else "")
             + f"; 3D Gaussian splats need {', '.join(_NEEDED)}"
         )
-    rest = [name for name in present if name.startswith("f_rest_")]
-    known = {*_NEEDED, *_SKIPPED, *rest, _FILTER}
+    harmonics = [name for name in present if name.startswith("f_rest_")]
+    known = {*_NEEDED, *_SKIPPED, *harmonics, _FILTER}
     if unknown := [name for name in present if name not in known]:
         raise InputError(
             f"{path}: property {', '.join(unknown[:9])} of 'vertex' is not known and "
             "may change the picture; export plain 3D Gaussian splats, or remove it if "
             "it does not"
         )
-    wanted = [f"f_rest_{i}" for i in range(len(rest))]
-    if len(rest) not in REST_OF_DEGREE or set(rest) != set(wanted):
+    expected = [f"f_rest_{i}" for i in range(len(harmonics))]
+    if len(harmonics) not in REST_OF_DEGREE or set(harmonics) != set(expected):
         raise InputError(
-            f"{path}: {len(rest)} properties f_rest_*; spherical harmonics of degree 0 "
-            "to 3 have f_rest_0 up to none, 8, 23 or 44"
+            f"{path}: {len(harmonics)} properties f_rest_*; spherical harmonics of "
+            "degree 0 to 3 have f_rest_0 up to none, 8, 23 or 44"
         )
 
 
@@ -234,8 +234,8 @@ def _decode(path: str | Path, rows: np.ndarray) -> Splats:
     """Turn the trained parameters into what they stand for."""
     if not len(rows):
         raise InputError(f"{path}: element vertex: 0; at least 1 is needed")
-    rest = sum(name.startswith("f_rest_") for name in rows.dtype.names or ())
-    per_channel = rest // 3
+    n_coefficients = sum(name.startswith("f_rest_") for name in rows.dtype.names or ())
+    per_channel = n_coefficients // 3
     harmonics = np.empty((len(rows), 1 + per_channel, 3), np.float32)
     harmonics[:, 0] = _columns(path, rows, _COLOURS)
     for channel in range(3):  # the file holds channel after channel

@@ -74,8 +74,8 @@ class VertexColours:
             texture = mi.Float(dr.detach(self.field.texture.array))
             finest = self.field.levels()[-1]
             if not is_same_beside(finest, texture, self._summed):
-                rest = without(finest, texture)
-                self._others = mi.Color3f(*self.field.sums(self._places, rest)[1:])
+                masked = without(finest, texture)
+                self._others = mi.Color3f(*self.field.sums(self._places, masked)[1:])
                 self._others, self._summed = dr.ravel(self._others), texture
             self._texture = texture
             raw = self._others + colours_of(finest, texture)

@@ -30,14 +30,14 @@ class Score:
         square: sum over rays of the squared sRGB error, mean over channels.
         rays: used.
         listed: samples where light might come from.
-        kept: samples that light reaches the eye from.
+        visible: samples that light reaches the eye from.
     """
 
     loss: mi.Float = field(default_factory=lambda: mi.Float(0))
     square: mi.Float = field(default_factory=lambda: mi.Float(0))
     rays: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
     listed: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
-    kept: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
+    visible: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
 
     def plus(self, other: Score) -> Score:
         """Add up."""
@@ -46,7 +46,7 @@ class Score:
             self.square + other.square,
             self.rays + other.rays,
             self.listed + other.listed,
-            self.kept + other.kept,
+            self.visible + other.visible,
         )
 
 

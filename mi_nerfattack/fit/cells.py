@@ -25,8 +25,8 @@ def grid_shape(
     flat too, and a ray above the ground should meet few occupied cells.
     """
     extent = np.asarray(upper, float) - lower
-    wanted = np.round(resolution * extent / extent.max())
-    x, y, z = np.maximum((resolution + 1) // 2, wanted).astype(int)
+    counts = np.round(resolution * extent / extent.max())
+    x, y, z = np.maximum((resolution + 1) // 2, counts).astype(int)
     return int(x), int(y), int(z)
 
 

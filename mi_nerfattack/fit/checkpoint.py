@@ -17,7 +17,7 @@ from mi_nerfattack.io.resumable import (
     array_digest,
     check_entries,
     json_digest,
-    misfits_told,
+    misfits_reported,
 )
 
 FORMAT = "mi_nerfattack fit checkpoint 4"
@@ -59,12 +59,15 @@ class FitCheckpoint:
         self.history: list[FitProgress] = []
         identity = {"format": FORMAT, **versions(), "fit": _digest(training)}
         self._unit = Unit(path, identity, FitRecord, _REMEDY)
-        kept = None if anew else self._unit.read()
-        if kept is not None:
-            check_entries(path, kept.tensors, training.tensors())
-            with misfits_told(path):
-                training.load_tensors(kept.tensors)
-            self.elapsed_s, self.history = kept.record.elapsed_s, kept.record.history
+        content = None if anew else self._unit.read()
+        if content is not None:
+            check_entries(path, content.tensors, training.tensors())
+            with misfits_reported(path):
+                training.load_tensors(content.tensors)
+            self.elapsed_s, self.history = (
+                content.record.elapsed_s,
+                content.record.history,
+            )
         files.check_writable(path)
         self._written = time.perf_counter()
         self._cost_s = 0.0
@@ -103,5 +106,5 @@ def _digest(training: Training) -> str:
     arrays += [] if training.depth is None else list(training.depth)
     metadata = training.field.metadata()
     info = {key: metadata[key] for key in metadata if key not in training.field.info}
-    about = images.camera, images.cameras, options, info, training.pixels
-    return json_digest([array_digest(arrays), repr(about)])[:16]
+    settings = images.camera, images.cameras, options, info, training.pixels
+    return json_digest([array_digest(arrays), repr(settings)])[:16]

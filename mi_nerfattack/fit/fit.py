@@ -282,7 +282,7 @@ class _Clock:
             self.elapsed,
             self.training.field.occupancy.fraction,
             rays / steps,
-            int(total.kept[0]) / steps,
+            int(total.visible[0]) / steps,
         )
         self.history.append(at)
         self._is_stuck = self._stands_still()

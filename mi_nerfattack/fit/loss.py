@@ -73,33 +73,33 @@ def loss_and_cotangent(
         objective by radiance, opacity and moment.
     """
     behind = dr.detach(background)
-    wanted = dr.linear_to_srgb(
+    target = dr.linear_to_srgb(
         batch.alpha * dr.srgb_to_linear(batch.colour) + (1 - batch.alpha) * behind
     )
 
-    def compare(seen: March) -> tuple[Any, Any]:
-        linear = seen.radiance + (1 - seen.opacity) * background
+    def compare(integrals: March) -> tuple[Any, Any]:
+        linear = integrals.radiance + (1 - integrals.opacity) * background
         if gain is not None:
             linear *= gain
-        error = dr.linear_to_srgb(linear * _BELOW_WHITE) - wanted
+        error = dr.linear_to_srgb(linear * _BELOW_WHITE) - target
         terms = [huber(channel, weights.huber) for channel in error]
         loss = (terms[0] + terms[1] + terms[2]) / 3
         if batch.depth is not None:
-            loss += _geometry_loss(seen, batch.depth, weights)
+            loss += _geometry_loss(integrals, batch.depth, weights)
         return loss, dr.squared_norm(mi.Vector3f(error)) / 3
 
     with dr.suspend_grad():
         loss, square = compare(primal)
-    cotangent = vjp(lambda seen: compare(seen)[0], primal, share)
+    cotangent = vjp(lambda integrals: compare(integrals)[0], primal, share)
     return loss, square, cotangent
 
 
-def _geometry_loss(seen: March, depth: Any, weights: LossWeights) -> Any:
+def _geometry_loss(integrals: March, depth: Any, weights: LossWeights) -> Any:
     is_known = ~dr.isnan(depth)
     is_hit = dr.isfinite(depth)
     known = dr.select(is_hit, depth, 1)
-    moment_error = dr.select(is_hit, seen.moment / known - 1, 0)
-    opacity_error = seen.opacity - dr.select(is_hit, mi.Float(1), 0)
+    moment_error = dr.select(is_hit, integrals.moment / known - 1, 0)
+    opacity_error = integrals.opacity - dr.select(is_hit, mi.Float(1), 0)
     loss = weights.depth * huber(moment_error, _MOMENT_DELTA) + (
         weights.opacity * huber(opacity_error, _OPACITY_DELTA)
     )

@@ -158,10 +158,10 @@ def seen_cells(
         back = _BACK * near
         open_to = _in_view(images, int(index), points[before], 0.0, 0.0, back)
         clear[before[open_to]] = False
-    seen = (clear & (count >= min(cameras, len(indices)))).reshape(coarse)
+    cells = (clear & (count >= min(cameras, len(indices)))).reshape(coarse)
     for axis in range(3):
-        seen = np.repeat(seen, _COARSE, axis)
-    return np.ascontiguousarray(seen[: shape[0], : shape[1], : shape[2]])
+        cells = np.repeat(cells, _COARSE, axis)
+    return np.ascontiguousarray(cells[: shape[0], : shape[1], : shape[2]])
 
 
 def _nearest(images: PosedImages, indices: np.ndarray) -> np.ndarray:

@@ -16,10 +16,10 @@ from mi_nerfattack.fit.scores import ViewScore
 from mi_nerfattack.ranges import (
     Count,
     Fraction,
+    Natural,
     Positive,
     Share,
     SomeShare,
-    Whole,
     checked,
 )
 
@@ -65,12 +65,12 @@ class FitOptions:
     patience: Count | None = None
     batch_rays: Count = 1 << 14
     samples: Count = 1 << 16
-    seed: Whole = 0
+    seed: Natural = 0
     learning_rate: Fraction = 1e-2
     final_rate: SomeShare = 0.03
     occupancy_resolution: Count = 128
     occupancy_every: Count = 16
-    occupancy_start: Whole = 128
+    occupancy_start: Natural = 128
     min_weight: Share = 0.02
     sky: bool = True
     exposure: bool = False
@@ -140,7 +140,7 @@ class FitResult:
             path: field file.
             provenance: source and settings, for the file's header.
         """
-        about = {
+        header = {
             **provenance,
             "steps": str(self.steps),
             "held_out": "every 8th image, from the first",
@@ -148,7 +148,7 @@ class FitResult:
             "psnr_heldout_db": f"{self.psnr_heldout_db:.3f}",
             "ssim_heldout": f"{self.ssim_heldout:.4f}",
         }
-        self.field.info.update({f"fit.{key}": text for key, text in about.items()})
+        self.field.info.update({f"fit.{key}": text for key, text in header.items()})
         save_field(path, self.field)
 
 

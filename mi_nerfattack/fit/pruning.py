@@ -119,11 +119,11 @@ def _note_weights(
     """Raise the largest weights of cells (cells,) to those of rays' samples."""
     depth = mi.Float(0)
     while active:
-        walk, here = walk.next([posed], active)
-        active = here.active
-        point = walk.paths[0].at(here.t)
+        walk, segment = walk.next([posed], active)
+        active = segment.active
+        point = walk.paths[0].at(segment.t)
         density = posed.in_world(posed.field.density(point, active))
-        (step,) = here.depths([density])
+        (step,) = segment.depths([density])
         weight = dr.exp(-depth) * (1 - dr.exp(-step))
         unit = dr.clip(posed.field.unit(point), 0, 1)
         cell = dr.minimum(mi.Vector3u(unit * mi.Vector3f(shape)), shape - 1)

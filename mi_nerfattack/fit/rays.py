@@ -166,43 +166,44 @@ class RayBank:
         return image, index - start, dr.maximum(width, 1)  # 0 in lanes without a ray
 
     def _seeing(self, lower: np.ndarray, upper: np.ndarray) -> Any:
-        box = mi.Point3f(*lower.tolist()), mi.Point3f(*upper.tolist())
-        found = []
+        low, high = mi.Point3f(*lower.tolist()), mi.Point3f(*upper.tolist())
+        indices = []
         for start in range(0, self.count, _CHUNK):
             size = min(_CHUNK, self.count - start)
             index = dr.arange(mi.UInt32, size) + dr.opaque(mi.UInt32, start)
-            near, far = meet_box(*self._rays(index)[1:], *box)
-            seen = dr.compress((near <= far) & (far > 0))
-            if dr.width(seen) > 0:
-                found.append(seen + start)
-        if not found:
+            _, origin, direction = self._rays(index)
+            near, far = meet_box(origin, direction, lower=low, upper=high)
+            hits = dr.compress((near <= far) & (far > 0))
+            if dr.width(hits) > 0:
+                indices.append(hits + start)
+        if not indices:
             raise InputError(
                 f"bounds: {lower.tolist()} to {upper.tolist()}; no image sees this "
                 "box, give bounds around what the cameras look at"
             )
-        return dr.concat(found)
+        return dr.concat(indices)
 
     def _counting(self, masks: np.ndarray) -> Any:
-        kept = np.flatnonzero(masks)
+        pixels = np.flatnonzero(masks)
         if self._chosen is not None:
-            kept = np.intersect1d(kept, self._chosen.numpy())
-        if not len(kept):
+            pixels = np.intersect1d(pixels, self._chosen.numpy())
+        if not len(pixels):
             raise InputError(
                 "masks: leave no pixel of the images that sees the box; what is to be "
                 "fitted must be white in some"
             )
-        return mi.UInt32(kept.astype(np.uint32))
+        return mi.UInt32(pixels.astype(np.uint32))
 
 
 def _check_depth(images: PosedImages, depth: np.ndarray | None) -> None:
     if depth is None:
         return
-    found = [each.shape for each in depth]
-    wanted = [image.shape[:2] for image in images.images]
-    if found != wanted:
+    shapes = [each.shape for each in depth]
+    image_shapes = [image.shape[:2] for image in images.images]
+    if shapes != image_shapes:
         raise InputError(
-            f"depth: shape {depth.shape}, maps of {sorted(set(found))}; must be "
-            f"{len(images)} maps of {sorted(set(wanted))}, as the images"
+            f"depth: shape {depth.shape}, maps of {sorted(set(shapes))}; must be "
+            f"{len(images)} maps of {sorted(set(image_shapes))}, as the images"
         )
 
 

@@ -58,13 +58,13 @@ class Pictures:
     """One view as it should be and as a field shows it.
 
     Attributes:
-        wanted: (height, width, 3), sRGB in [0, 1].
+        expected: (height, width, 3), sRGB in [0, 1].
         shown: by the field.
         depth: (height, width), metres along the ray, infinite or NaN where there is
             no surface; None if unknown.
     """
 
-    wanted: np.ndarray
+    expected: np.ndarray
     shown: Rendering
     depth: np.ndarray | None = None
 
@@ -139,11 +139,11 @@ class FieldRenderer:
             colour = result.radiance + (1 - result.opacity) * behind
             depth = result.depth
             dr.eval(colour, result.opacity, depth)
-        size = (camera.height, camera.width)
+        height, width = camera.height, camera.width
         return Rendering(
-            linear_to_srgb_numpy(colour.numpy().T.reshape(*size, 3)),
-            result.opacity.numpy().reshape(size).copy(),
-            depth.numpy().reshape(size).copy(),
+            linear_to_srgb_numpy(colour.numpy().T.reshape(height, width, 3)),
+            result.opacity.numpy().reshape(height, width).copy(),
+            depth.numpy().reshape(height, width).copy(),
         )
 
     def score(
@@ -151,7 +151,7 @@ class FieldRenderer:
         name: str,
         camera: Camera,
         camera_to_world: np.ndarray,
-        wanted: np.ndarray,
+        expected: np.ndarray,
         *,
         depth: np.ndarray | None = None,
         mask: np.ndarray | None = None,
@@ -162,7 +162,7 @@ class FieldRenderer:
             name: of the view.
             camera: intrinsics.
             camera_to_world: (4, 4), OpenCV axes, metres.
-            wanted: (height, width, 3), sRGB in [0, 1].
+            expected: (height, width, 3), sRGB in [0, 1].
             depth: of the picture; see `Pictures.depth`.
             mask: (height, width), bool, the pixels that count; None for all.
 
@@ -170,11 +170,11 @@ class FieldRenderer:
             the score, with its pictures.
         """
         shown = self.render(camera, camera_to_world)
-        psnr, ssim = compare(shown.image, wanted, mask)
+        psnr, ssim = compare(shown.image, expected, mask)
         holes = float("nan")
         if depth is not None:
             holes = self.holes(shown, camera, camera_to_world, depth)
-        pictures = Pictures(wanted, shown, depth)
+        pictures = Pictures(expected, shown, depth)
         return ViewScore(name, psnr, ssim, shown.hazy, holes, pictures=pictures)
 
     def holes(
@@ -263,8 +263,8 @@ def keep_worst(scores: Sequence[ViewScore], count: int) -> list[ViewScore]:
 
 def worst_views(scores: Iterable[ViewScore]) -> list[ViewScore]:
     """Return the views whose pictures are kept, worst first."""
-    kept = [score for score in scores if score.pictures is not None]
-    return sorted(kept, key=lambda score: score.psnr_db)
+    views = [score for score in scores if score.pictures is not None]
+    return sorted(views, key=lambda score: score.psnr_db)
 
 
 def mean(scores: Iterable[ViewScore], name: str) -> float:
@@ -305,10 +305,10 @@ def compare(
         use_sample_covariance=False,
         full=True,
     )[1]
-    whole = np.s_[_WINDOW:-_WINDOW, _WINDOW:-_WINDOW]  # windows within the image
-    counted = mask[whole]
+    interior = np.s_[_WINDOW:-_WINDOW, _WINDOW:-_WINDOW]  # windows within the image
+    counted = mask[interior]
     ssim = (
-        similar[whole][counted].mean(dtype=np.float64)
+        similar[interior][counted].mean(dtype=np.float64)
         if counted.any()
         else float("nan")
     )

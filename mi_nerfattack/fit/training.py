@@ -171,9 +171,9 @@ class Training:
         rays = int(total.rays[0])
         self.rays += rays
         listed = int(total.listed[0]) / max(rays, 1)
-        kept = int(total.kept[0]) / max(rays, 1)
+        visible = int(total.visible[0]) / max(rays, 1)
         # a batch that overflowed tells of its first rays alone: grow gently
-        size = self._size(max(kept, listed / _LISTED))
+        size = self._size(max(visible, listed / _LISTED))
         self.limit = min(size, 2 * self.limit)
         return total
 

@@ -60,14 +60,14 @@ _REASONS = {
 def read_bytes(path: str | Path, limit: int) -> bytes:
     """Read a regular file of at most `limit` bytes."""
     piece = max(_check_file(path, limit), 1 << 16)  # files of the system tell 0 bytes
-    parts, size = [], 0
+    chunks, size = [], 0
     with reported(path), open(path, "rb") as file:
-        while size <= limit and (part := file.read(piece)):
-            parts.append(part)
-            size += len(part)
+        while size <= limit and (chunk := file.read(piece)):
+            chunks.append(chunk)
+            size += len(chunk)
     if size > limit:
         raise InputError(f"{path}: more than {limit} bytes; it grows while it is read")
-    return b"".join(parts)
+    return b"".join(chunks)
 
 
 def sha256(path: str | Path) -> str:
@@ -161,8 +161,8 @@ def read_safetensors(
         The tensors by name, and the file's metadata.
     """
     with open_safetensors(path) as file:
-        wanted = file.keys() if names is None else names
-        tensors = {name: file.get_tensor(name) for name in wanted}
+        keys = file.keys() if names is None else names
+        tensors = {name: file.get_tensor(name) for name in keys}
         return tensors, dict(file.metadata() or {})
 
 
@@ -253,7 +253,7 @@ def write_bytes(path: str | Path, data: bytes) -> None:
     _write(path, [data])
 
 
-def _write(path: str | Path, parts: Sequence[bytes | memoryview]) -> None:
+def _write(path: str | Path, chunks: Sequence[bytes | memoryview]) -> None:
     with reported(path):
         target = Path(os.path.realpath(path))
         if target.is_dir():
@@ -262,7 +262,7 @@ def _write(path: str | Path, parts: Sequence[bytes | memoryview]) -> None:
             raise InputError(f"{path}: is not a regular file; choose another name")
         partial = _temporary(target)
         try:
-            _write_new(partial, parts)
+            _write_new(partial, chunks)
             os.replace(partial, target)
         finally:
             partial.unlink(missing_ok=True)
@@ -377,12 +377,12 @@ def _temporary(target: Path) -> Path:
     return target.with_name(f".{target.name[:80]}.{secrets.token_hex(6)}.tmp")
 
 
-def _write_new(path: Path, parts: Sequence[bytes | memoryview]) -> None:
+def _write_new(path: Path, chunks: Sequence[bytes | memoryview]) -> None:
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
     try:
-        for rest in map(memoryview, parts):
-            while rest:
-                rest = rest[os.write(descriptor, rest) :]
+        for view in map(memoryview, chunks):
+            while view:
+                view = view[os.write(descriptor, view) :]
         os.fsync(descriptor)
     finally:
         os.close(descriptor)

@@ -34,12 +34,12 @@ class GrowingFile:
 
     def write(self, data: bytes) -> int:
         """Append bytes, all of them."""
-        rest = memoryview(data)
+        view = memoryview(data)
         with files.reported(self.path):
-            while rest:
-                written = os.write(self._descriptor, rest)
+            while view:
+                written = os.write(self._descriptor, view)
                 self._size += written
-                rest = rest[written:]
+                view = view[written:]
         return len(data)
 
     def flush(self) -> None:

@@ -104,10 +104,10 @@ def remove_partial(folder: str | Path) -> list[Path]:
     Returns:
         the files that were removed.
     """
-    found = [path for path in Path(folder).rglob(".*.tmp") if is_partial(path)]
-    for path in found:
+    paths = [path for path in Path(folder).rglob(".*.tmp") if is_partial(path)]
+    for path in paths:
         path.unlink(missing_ok=True)
-    return found
+    return paths
 
 
 def is_partial(path: Path) -> bool:

@@ -59,7 +59,7 @@ def set_keys(name: str, text: str, settings: Sequence[str]) -> str:
         if key in keys:
             raise InputError(f"--set {setting}: {key} is set twice; set it once")
         keys.add(key)
-        *way, last = _parts(key)
+        *way, last = _keys(key)
         table: Any = document
         for part in way:
             if isinstance(part, str) and isinstance(table, dict):
@@ -82,8 +82,8 @@ def find_setting(settings: Sequence[str], location: Sequence[str | int]) -> str 
         location: keys that lead to the value.
     """
     for setting in settings:
-        parts = [*_parts(split_setting(setting)[0])]
-        if parts == [*location][: len(parts)]:
+        keys = [*_keys(split_setting(setting)[0])]
+        if keys == [*location][: len(keys)]:
             return setting
     return None
 
@@ -91,7 +91,7 @@ def find_setting(settings: Sequence[str], location: Sequence[str | int]) -> str 
 def tell(
     path: str | Path,
     text: str,
-    found: Iterable[tuple[Sequence[str | int], str]],
+    problems: Iterable[tuple[Sequence[str | int], str]],
     settings: Sequence[str] = (),
 ) -> str:
     """Describe the problems of a file, each with its line and key; of many, the first.
@@ -99,12 +99,12 @@ def tell(
     Args:
         path: the file.
         text: its content, valid TOML.
-        found: keys that lead to each problem, and what is wrong.
+        problems: keys that lead to each problem, and what is wrong.
         settings: of the command line, see :func:`set_keys`; the description of a
             problem with a setting names the setting instead of a line.
     """
-    found, lines = list(found), []
-    for location, problem in found[:_MOST_PROBLEMS]:
+    problems, lines = list(problems), []
+    for location, problem in problems[:_MOST_PROBLEMS]:
         if setting := find_setting(settings, location):
             where = f"--set {setting}"
         else:
@@ -112,8 +112,8 @@ def tell(
             where = f"{path}:{line}" if line else f"{path}"
         key = ".".join(map(str, location))
         lines.append(f"{where}: {key}: {problem}")
-    if more := len(found) - len(lines):
-        lines.append(f"{path}: and {more} more")
+    if omitted := len(problems) - len(lines):
+        lines.append(f"{path}: and {omitted} more")
     return "\n".join(lines)
 
 
@@ -147,7 +147,7 @@ def _line_of(text: str, location: Sequence[str | int]) -> int | None:
     return tomlkit.dumps(document).partition(_MARK)[0].count("\n") + 1
 
 
-def _parts(key: str) -> Iterator[str | int]:
+def _keys(key: str) -> Iterator[str | int]:
     for part in key.split("."):
         yield int(part) if part.isdigit() else part
 

@@ -26,11 +26,11 @@ from mi_nerfattack.io import files
 
 def array_digest(arrays: Iterable[np.ndarray]) -> str:
     """Return the SHA-256 of types, shapes and values of arrays, in their order."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for values in arrays:
-        found.update(f"{values.dtype} {values.shape}".encode())
-        found.update(np.ascontiguousarray(values).reshape(-1).data)
-    return found.hexdigest()
+        digest.update(f"{values.dtype} {values.shape}".encode())
+        digest.update(np.ascontiguousarray(values).reshape(-1).data)
+    return digest.hexdigest()
 
 
 def json_digest(value: Any) -> str:
@@ -55,7 +55,7 @@ R = TypeVar("R", bound=Record)
 
 
 @dataclass(frozen=True, eq=False)
-class Kept(Generic[R]):
+class UnitContent(Generic[R]):
     """The content of a unit's file.
 
     Attributes:
@@ -91,10 +91,10 @@ class Unit(Generic[R]):
         Raises:
             InputError: it cannot be written; the file that was there is intact.
         """
-        about = {_RECORD: record.model_dump_json(), _CHECKSUM: _checksum(tensors)}
-        files.write_safetensors(self.path, tensors, {**self.identity, **about})
+        header = {_RECORD: record.model_dump_json(), _CHECKSUM: _checksum(tensors)}
+        files.write_safetensors(self.path, tensors, {**self.identity, **header})
 
-    def read(self, force: bool = False) -> Kept[R] | None:
+    def read(self, force: bool = False) -> UnitContent[R] | None:
         """Read the file; None where the unit is not done.
 
         Args:
@@ -113,7 +113,8 @@ class Unit(Generic[R]):
                 f"{self.path}: damaged, its checksum is wrong; copy it again, or start "
                 "again without the file"
             )
-        return Kept(tensors, *self._judge(metadata, force))
+        record, ignored = self._judge(metadata, force)
+        return UnitContent(tensors, record, ignored)
 
     def read_record(self) -> R | None:
         """Read the record alone; None where the unit is not done.
@@ -130,11 +131,11 @@ class Unit(Generic[R]):
         return self._judge(metadata, False)[0]
 
     def _check_format(self, metadata: Mapping[str, str]) -> None:
-        wanted = self.identity["format"]
-        if metadata.get("format") != wanted or _RECORD not in metadata:
+        expected = self.identity["format"]
+        if metadata.get("format") != expected or _RECORD not in metadata:
             raise InputError(
                 f"{self.path}: format {metadata.get('format')!r}, this program reads "
-                f"{wanted!r}; start again without the file"
+                f"{expected!r}; start again without the file"
             )
 
     def _judge(self, metadata: dict[str, str], force: bool) -> tuple[R, list[str]]:
@@ -143,11 +144,11 @@ class Unit(Generic[R]):
             for key, value in metadata.items()
             if key not in (_RECORD, _CHECKSUM)
         }
-        found = differences(identity, self.identity)
+        changes = differences(identity, self.identity)
         if not force:
-            refuse(self.path, found, self.remedy)
+            refuse(self.path, changes, self.remedy)
         try:
-            return self.model.model_validate_json(metadata[_RECORD]), found
+            return self.model.model_validate_json(metadata[_RECORD]), changes
         except pydantic.ValidationError as err:
             raise InputError(
                 f"{self.path}: its record is damaged ({err.errors()[0]['msg']}); start "
@@ -156,18 +157,18 @@ class Unit(Generic[R]):
 
 
 def check_entries(
-    path: Path, found: Mapping[str, np.ndarray], needed: Mapping[str, np.ndarray]
+    path: Path, tensors: Mapping[str, np.ndarray], needed: Mapping[str, np.ndarray]
 ) -> None:
     """Raise InputError unless tensors have the types and shapes that are needed.
 
     Args:
         path: their file.
-        found: tensors of the file, by name; those that are not needed are ignored.
+        tensors: tensors of the file, by name; those that are not needed are ignored.
         needed: examples of the needed tensors, by name; where an example is empty, the
             first axis may have any length.
     """
     for name, like in needed.items():
-        value, free = found.get(name), 0 if like.size else 1
+        value, free = tensors.get(name), 0 if like.size else 1
         kind = None if value is None else (value.dtype, value.shape[free:], value.ndim)
         if kind != (like.dtype, like.shape[free:], like.ndim):
             there = "missing" if value is None else f"{value.dtype} {value.shape}"
@@ -178,7 +179,7 @@ def check_entries(
 
 
 @contextmanager
-def misfits_told(path: Path) -> Iterator[None]:
+def misfits_reported(path: Path) -> Iterator[None]:
     """Tell of entries whose values do not go together, whatever stumbles over them."""
     try:
         yield
@@ -191,16 +192,16 @@ def misfits_told(path: Path) -> Iterator[None]:
         ) from err
 
 
-def refuse(path: str | Path, found: Sequence[str], remedy: str) -> None:
+def refuse(path: str | Path, changes: Sequence[str], remedy: str) -> None:
     """Raise InputError if a file differs from what is wanted.
 
     Args:
         path: the file.
-        found: of :func:`differences`.
+        changes: of :func:`differences`.
         remedy: what to do.
     """
-    if found:
-        lines = "\n".join(f"  {line}" for line in found)
+    if changes:
+        lines = "\n".join(f"  {line}" for line in changes)
         raise InputError(
             f"{path}: belongs to something else (value there -> value here)\n"
             f"{lines}\n{remedy}"
@@ -214,31 +215,33 @@ def flatten(name: str, value: Any) -> dict[str, str]:
         ``{"name.key": "1", ...}``; what is no object is one value.
     """
     if isinstance(value, dict) and value:
-        parts = [flatten(f"{name}.{key}", item) for key, item in value.items()]
-        return {key: text for part in parts for key, text in part.items()}
+        branches = [flatten(f"{name}.{key}", item) for key, item in value.items()]
+        return {key: text for branch in branches for key, text in branch.items()}
     return {name: json.dumps(value, sort_keys=True)}
 
 
-def differences(kept: Mapping[str, str], present: Mapping[str, str]) -> list[str]:
+def differences(stored: Mapping[str, str], present: Mapping[str, str]) -> list[str]:
     """Compare two identities.
 
     A value that is JSON with the keys ``file`` and ``sha256`` describes a file: only
     the file's content counts.
 
     Returns:
-        a line for each key whose values differ: ``key: kept -> present``.
+        a line for each key whose values differ: ``key: stored -> present``.
     """
-    keys = [*present, *(key for key in kept if key not in present)]
-    return [line for key in keys if (line := _difference(key, kept.get(key), present))]
+    keys = [*present, *(key for key in stored if key not in present)]
+    return [
+        line for key in keys if (line := _difference(key, stored.get(key), present))
+    ]
 
 
-def _difference(key: str, kept: str | None, present: Mapping[str, str]) -> str:
+def _difference(key: str, stored: str | None, present: Mapping[str, str]) -> str:
     now = present.get(key)
-    if kept == now:
+    if stored == now:
         return ""
-    old, new = _as_file(kept), _as_file(now)
+    old, new = _as_file(stored), _as_file(now)
     if old is None or new is None:
-        return f"{key}: {_shown(kept, old)} -> {_shown(now, new)}"
+        return f"{key}: {_shown(stored, old)} -> {_shown(now, new)}"
     if old["sha256"] == new["sha256"]:
         return ""
     if old["file"] == new["file"]:

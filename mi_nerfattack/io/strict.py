@@ -39,8 +39,8 @@ def parse_json(path: str | Path, text: str) -> Any:
             text,
             object_pairs_hook=_unique_keys,
             parse_constant=_refuse,
-            parse_float=lambda given: _number(float(given), given),
-            parse_int=lambda given: _number(_whole(given), given),
+            parse_float=lambda literal: _number(float(literal), literal),
+            parse_int=lambda literal: _number(_integer(literal), literal),
         )
     except json.JSONDecodeError as err:
         raise InputError(
@@ -79,20 +79,24 @@ class _NumberError(ValueError):
     """NaN, infinity or a number that 64 bits do not hold, in JSON."""
 
 
-def _refuse(given: str) -> None:
-    short = given if len(given) < 40 else f"{given[:30]}... ({len(given)} characters)"
+def _refuse(literal: str) -> None:
+    short = (
+        literal
+        if len(literal) < 40
+        else f"{literal[:30]}... ({len(literal)} characters)"
+    )
     raise _NumberError(short)
 
 
-def _number(value: float, given: str) -> float:
+def _number(value: float, literal: str) -> float:
     if not math.isfinite(value):
-        _refuse(given)
+        _refuse(literal)
     return value
 
 
-def _whole(given: str) -> float:
+def _integer(literal: str) -> float:
     """Return an integer, or infinity where 64 bits do not hold it."""
-    value = int(given) if len(given) <= 20 else math.inf
+    value = int(literal) if len(literal) <= 20 else math.inf
     return value if -(1 << 63) <= value < 1 << 63 else math.inf
 
 
@@ -113,8 +117,8 @@ def _key_of_number(text: str) -> str:
         return None
 
     try:
-        found = find(json.loads(text, parse_int=_whole)) or ""
-        return found.lstrip(".") or "a value"
+        location = find(json.loads(text, parse_int=_integer)) or ""
+        return location.lstrip(".") or "a value"
     except (ValueError, RecursionError):
         return "a value"  # what follows is damaged too
 

@@ -100,8 +100,8 @@ def _to_yuv(image: np.ndarray) -> Any:
     kinds = load_extra("av.video.reformatter", _PURPOSE)
     height, width = image.shape[:2]
     even = even_size(width, height)
-    more = ((0, even[1] - height), (0, even[0] - width), (0, 0))
-    frame = VideoFrame.from_ndarray(np.pad(image, more, "edge"), format="rgb24")
+    padding = ((0, even[1] - height), (0, even[0] - width), (0, 0))
+    frame = VideoFrame.from_ndarray(np.pad(image, padding, "edge"), format="rgb24")
     return frame.reformat(
         format="yuv420p",
         dst_colorspace=kinds.Colorspace.ITU709,

@@ -103,7 +103,9 @@ class Trajectory:
             turn = torch.atan(self.wheelbase_m * curvature)
         if len(self.controls) == 1:
             return turn
-        return torch.stack([turn, self.speed_gain * (self._wanted(way) - speed)], 1)
+        return torch.stack(
+            [turn, self.speed_gain * (self._target_speed(way) - speed)], 1
+        )
 
     def _curvature(
         self, path: torch.Tensor, way: torch.Tensor, speed: torch.Tensor
@@ -122,7 +124,7 @@ class Trajectory:
         square = point.square().sum(1)
         return 2 * point[:, 1] / (square + _NEAR_M**2 * (square < _NEAR_M**2))
 
-    def _wanted(self, way: torch.Tensor) -> torch.Tensor:
+    def _target_speed(self, way: torch.Tensor) -> torch.Tensor:
         """Return the mean speed along the path until `speed_s`, (n,)."""
         times = (0.0, *self.times_s)
         until = self.speed_s or self.times_s[-1]
@@ -203,10 +205,10 @@ class Action:
             InputError: another shape, or a value that is not finite.
         """
         if self.trajectory is None:
-            found = columns_of(values, count, self.output, name)
+            controls = columns_of(values, count, self.output, name)
             if isinstance(self.scale, tuple):
-                return found * found.new_tensor(self.scale)
-            return self.scale * found
+                return controls * controls.new_tensor(self.scale)
+            return self.scale * controls
         if count == 1 and values.ndim and len(values) != 1:  # axes of size 1 dropped
             values = values[None]
         if values.ndim < 2 or len(values) != count or speed is None:

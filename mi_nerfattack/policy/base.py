@@ -47,12 +47,12 @@ class Numbers:
             "route": 2 * len(self.route_m),
             "time": int(self.time),
         }
-        found, start = {}, 0
+        slices, start = {}, 0
         for name, size in sizes.items():
             if size:
-                found[name] = slice(start, start + size)
+                slices[name] = slice(start, start + size)
             start += size
-        return found
+        return slices
 
 
 class AbstractPolicy(ABC):

@@ -51,12 +51,12 @@ class AbstractBlackBox(AbstractPolicy):
 
     @abstractmethod
     def answer(
-        self, given: Mapping[str, np.ndarray], goals: np.ndarray, step: int
+        self, arrays: Mapping[str, np.ndarray], goals: np.ndarray, step: int
     ) -> np.ndarray:
         """Ask the policy.
 
         Args:
-            given: inputs by name: images as the pre-processing gives them, float32,
+            arrays: inputs by name: images as the pre-processing gives them, float32,
                 (n, c, h, w) by default, and the numbers that the policy asks for.
             goals: (n,) int64.
             step: number of images before these in the drive.
@@ -76,19 +76,19 @@ class AbstractBlackBox(AbstractPolicy):
         images = to_torch(image).to("cpu", torch.float32)
         check_images(images)
         rows = None if numbers is None else to_torch(numbers).to("cpu", torch.float32)
-        given, stacks = {}, []
+        arrays, stacks = {}, []
         with torch.no_grad():
             pictures = self.inputs.pictures(images).items()
             for (name, picture), past in zip(pictures, memory[1:], strict=True):
                 planes = self.preprocess.transform(picture)
-                seen, past = self.preprocess.stack(planes, past)
+                frames, past = self.preprocess.stack(planes, past)
                 # a copy: functions may write into their image
-                given[name] = np.array(seen.numpy(), order="C")
+                arrays[name] = np.array(frames.numpy(), order="C")
                 stacks.append(past)
             numbers_by_name = self.inputs.by_name(rows)
-            given |= {key: np.array(v.numpy()) for key, v in numbers_by_name.items()}
+            arrays |= {key: np.array(v.numpy()) for key, v in numbers_by_name.items()}
             goals = expand_goals(goal, images).numpy().copy()
-            answer = self.answer(given, goals, memory[0])
+            answer = self.answer(arrays, goals, memory[0])
             values = torch.from_numpy(np.array(answer, np.float64))
             speed = None
             if self.action.needs_speed:
@@ -152,10 +152,10 @@ class CallablePolicy(AbstractBlackBox):
         AbstractBlackBox.__init__(self, name, preprocess, action, inputs)
 
     def answer(
-        self, given: Mapping[str, np.ndarray], goals: np.ndarray, step: int
+        self, arrays: Mapping[str, np.ndarray], goals: np.ndarray, step: int
     ) -> np.ndarray:
         """Call the function."""
-        every = {**given, GOAL: goals}
+        every = {**arrays, GOAL: goals}
         names = self.inputs.names or (*self.inputs.images, GOAL)
         arguments = [every[name] for name in names]
         try:

@@ -103,52 +103,52 @@ def columns_of(
     return values
 
 
-def misfit(wanted: Sequence[int | None], given: Sequence[int]) -> str:
+def misfit(expected: Sequence[int | None], actual: Sequence[int]) -> str:
     """Say which image a network takes, which it gets, and what to write.
 
     Args:
-        wanted: shape of its images, None where a size is free.
-        given: shape of those that it gets, from `policy.preprocess`.
+        expected: shape of its images, None where a size is free.
+        actual: shape of those that it gets, from `policy.preprocess`.
     """
-    sizes = ", ".join("any" if size is None else f"{size}" for size in wanted)
+    sizes = ", ".join("any" if size is None else f"{size}" for size in expected)
     return (
-        f"takes images of shape ({sizes}), and gets {tuple(given)} of the camera and "
-        f"policy.preprocess; write {_remedy(wanted)}"
+        f"takes images of shape ({sizes}), and gets {tuple(actual)} of the camera and "
+        f"policy.preprocess; write {_remedy(expected)}"
     )
 
 
 def usual_shape(
-    module: torch.nn.Module, image: torch.Tensor, rest: Sequence[torch.Tensor]
+    module: torch.nn.Module, image: torch.Tensor, further_inputs: Sequence[torch.Tensor]
 ) -> tuple[int, ...] | None:
     """Find a shape of images that a module takes, among those that are usual.
 
     Args:
         module: has refused `image`.
         image: (n, ...).
-        rest: goal and hidden states, which it gets with each.
+        further_inputs: goal and hidden states, which it gets with each.
 
     Returns:
         (n, channels, height, width) or (n, height, width, channels); None where it
         takes none of them, or the shape of `image` with other values.
     """
-    if _takes(module, torch.zeros_like(image), rest):
+    if _takes(module, torch.zeros_like(image), further_inputs):
         return None
     kernels = [p.shape[1] for p in module.parameters() if p.ndim == 4][:1]
     for width, height in USUAL_PX:
         for channels in kernels or (3, 1):
             planes, pixels = (channels, height, width), (height, width, channels)
             for shape in ((len(image), *planes), (len(image), *pixels)):
-                if _takes(module, image.new_zeros(shape), rest):
+                if _takes(module, image.new_zeros(shape), further_inputs):
                     return shape
     return None
 
 
 def _takes(
-    module: torch.nn.Module, image: torch.Tensor, rest: Sequence[torch.Tensor]
+    module: torch.nn.Module, image: torch.Tensor, further_inputs: Sequence[torch.Tensor]
 ) -> bool:
     try:
         with torch.no_grad():
-            module(image, *rest)
+            module(image, *further_inputs)
     except Exception as err:  # a user's module raises whatever it likes
         if is_interrupt(err):
             raise
@@ -156,11 +156,11 @@ def _takes(
     return True
 
 
-def _remedy(wanted: Sequence[int | None]) -> str:
+def _remedy(shape: Sequence[int | None]) -> str:
     """Return the keys of [policy.preprocess] that make images of a shape."""
-    if len(wanted) != 4:
+    if len(shape) != 4:
         return "policy.preprocess as the network needs it"
-    _, *sizes = wanted
+    _, *sizes = shape
     last = sizes[2] is not None and sizes[2] <= _CHANNELS < (sizes[0] or 99)
     height, width, channels = sizes if last else (*sizes[1:], sizes[0])
     keys = []

@@ -30,8 +30,8 @@ class DrJitNetwork(torch.nn.Module):
 
     def forward(self, image: torch.Tensor, *others: torch.Tensor) -> torch.Tensor:
         """Return (n, k)."""
-        parts = (part.to(image).reshape(len(image), -1) for part in (image, *others))
-        features = torch.cat(list(parts), dim=1)
+        blocks = (part.to(image).reshape(len(image), -1) for part in (image, *others))
+        features = torch.cat(list(blocks), dim=1)
         result: Any = _Call.apply(self.network, features)
         return result
 

@@ -45,10 +45,10 @@ class ExportedNetwork(torch.nn.Module):
 
     def forward(self, *arguments: torch.Tensor) -> Any:
         """Call the program."""
-        given = tuple(arguments[0].shape)
-        pairs = zip(self.sizes, given, strict=False)
+        shape = tuple(arguments[0].shape)
+        pairs = zip(self.sizes, shape, strict=False)
         if any(size not in (None, actual) for size, actual in pairs):
-            raise InputError(f"{self.name}: {misfit(self.sizes, given)}")
+            raise InputError(f"{self.name}: {misfit(self.sizes, shape)}")
         return self.program(*arguments)
 
 

@@ -95,13 +95,13 @@ class Inputs:
         """
         columns = self.by_name(numbers)
         names = self.names or (*images, GOAL)
-        found: list[torch.Tensor] = []
+        arguments: list[torch.Tensor] = []
         for name in names:
             if name == GOAL:
-                found += goals
+                arguments += goals
             else:
-                found.append(images[name] if name in images else columns[name])
-        return tuple(found)
+                arguments.append(images[name] if name in images else columns[name])
+        return tuple(arguments)
 
     def by_name(self, numbers: Any) -> dict[str, Any]:
         """Return columns (n, k) of torch or NumPy by name, of points as (n, k, 2).
@@ -118,10 +118,12 @@ class Inputs:
                 f"{self.numbers.size} numbers, and gets {shape}; this way of driving "
                 "it does not know them"
             )
-        parts = {k: numbers[:, columns] for k, columns in self.numbers.columns.items()}
-        if "route" in parts:
-            parts["route"] = parts["route"].reshape(len(numbers), -1, 2)
-        return parts
+        named_columns = {
+            k: numbers[:, columns] for k, columns in self.numbers.columns.items()
+        }
+        if "route" in named_columns:
+            named_columns["route"] = named_columns["route"].reshape(len(numbers), -1, 2)
+        return named_columns
 
 
 class AbstractGoal(ABC):

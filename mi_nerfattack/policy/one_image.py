@@ -27,20 +27,20 @@ class OneImage(torch.nn.Module):
         self.axes: list[int] = [tuple(shape).index(-1) for shape in recurrent]
 
     def forward(
-        self, image: torch.Tensor, *rest: torch.Tensor
+        self, image: torch.Tensor, *further_inputs: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
         """Return the control and the hidden states of all vehicles.
 
         Raises:
             InputError: the network gives more outputs, or fewer.
         """
-        goals = len(rest) - len(self.axes)
+        goals = len(further_inputs) - len(self.axes)
         axes = [0] * (1 + goals) + self.axes
         answers = []
         for i in range(len(image)):
             one = [
                 part.narrow(axis, i, 1)
-                for part, axis in zip((image, *rest), axes, strict=True)
+                for part, axis in zip((image, *further_inputs), axes, strict=True)
             ]
             result = self.network(*one)
             result = result if isinstance(result, (tuple, list)) else (result,)
@@ -54,4 +54,4 @@ class OneImage(torch.nn.Module):
             answers.append((result[0].reshape(1, -1), *result[1:]))
         columns = zip(*answers, strict=True)
         joined = zip(columns, [0, *self.axes], strict=True)
-        return tuple(torch.cat(parts, axis) for parts, axis in joined)
+        return tuple(torch.cat(column, axis) for column, axis in joined)

@@ -63,10 +63,10 @@ class FractionalCrop(AbstractTransform):
     """
 
     def __init__(self, top: float, bottom: float, left: float, right: float) -> None:
-        self.parts: tuple[float, float, float, float] = top, bottom, left, right
-        if min(self.parts) < 0 or top + bottom >= 1 or left + right >= 1:
+        self.fractions: tuple[float, float, float, float] = top, bottom, left, right
+        if min(self.fractions) < 0 or top + bottom >= 1 or left + right >= 1:
             raise InputError(
-                f"crop_fraction: {list(self.parts)}; none below 0, and top with "
+                f"crop_fraction: {list(self.fractions)}; none below 0, and top with "
                 "bottom, and left with right, below 1"
             )
 
@@ -75,7 +75,7 @@ class FractionalCrop(AbstractTransform):
         height, width = planes.shape[2:]
         sizes = (height, height, width, width)
         margins = [
-            int(p * size + 0.5) for p, size in zip(self.parts, sizes, strict=True)
+            int(p * size + 0.5) for p, size in zip(self.fractions, sizes, strict=True)
         ]
         return _cut(planes, margins)
 
@@ -151,11 +151,11 @@ class Resize(AbstractTransform):
 
     def _matrix(self, size: int, target: int, like: torch.Tensor) -> torch.Tensor:
         """Return weights (target, size), kept for the next image."""
-        kept = self._weights.get((size, target))
-        if kept is None or kept.dtype != like.dtype or kept.device != like.device:
-            kept = self.filter(size, target).to(like.device, like.dtype)
-            self._weights[size, target] = kept
-        return kept
+        matrix = self._weights.get((size, target))
+        if matrix is None or matrix.dtype != like.dtype or matrix.device != like.device:
+            matrix = self.filter(size, target).to(like.device, like.dtype)
+            self._weights[size, target] = matrix
+        return matrix
 
 
 class ToLinear(AbstractTransform):
@@ -342,11 +342,11 @@ class Preprocess:
             The network's input, and `past` for the next frame.
         """
         frames, known = self.select(planes, past)
-        kept = known[:, max(0, known.shape[1] - self.history) :]
+        recent = known[:, max(0, known.shape[1] - self.history) :]
         # a view would keep the frame that has dropped out
-        return self.layout(frames), kept if len(kept[0]) == len(
+        return self.layout(frames), recent if len(recent[0]) == len(
             known[0]
-        ) else kept.clone()
+        ) else recent.clone()
 
     def select(
         self, planes: torch.Tensor, past: torch.Tensor

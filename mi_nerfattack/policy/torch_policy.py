@@ -67,9 +67,9 @@ def call_module(
         if is_interrupt(err):
             raise
         shapes = [tuple(part.shape) for part in arguments]
-        wanted = usual_shape(module, arguments[0], arguments[1:])
-        if wanted not in (None, shapes[0]):
-            raise InputError(f"{name}: {misfit(wanted, shapes[0])}") from err
+        expected = usual_shape(module, arguments[0], arguments[1:])
+        if expected not in (None, shapes[0]):
+            raise InputError(f"{name}: {misfit(expected, shapes[0])}") from err
         raise InputError(
             f"{name}: fails on an input of shape {shapes[0]}, with further "
             f"inputs of shapes {shapes[1:]}: {type(err).__name__}: {err}; declare "
@@ -80,14 +80,14 @@ def call_module(
 
 def _tensors(result: Any, name: str) -> tuple[torch.Tensor, ...]:
     """Take a tensor, or a tuple or list of them, and nothing else."""
-    parts = tuple(result) if isinstance(result, (tuple, list)) else (result,)
-    wrong = [type(p).__name__ for p in parts if not isinstance(p, torch.Tensor)]
-    if wrong or not parts:
+    tensors = tuple(result) if isinstance(result, (tuple, list)) else (result,)
+    wrong = [type(p).__name__ for p in tensors if not isinstance(p, torch.Tensor)]
+    if wrong or not tensors:
         raise InputError(
             f"{name}: returns {f'a {wrong[0]}' if wrong else 'an empty tuple'}; the "
             "control as a tensor, or a tuple of it and the hidden states, is needed"
         )
-    return parts
+    return tensors
 
 
 _PLAIN = torch.contiguous_format
@@ -202,13 +202,13 @@ class TorchPolicy(AbstractPolicy):
         numbers: Any = None,
     ) -> tuple[Any, Memory, Any]:
         """Evaluate the module again and its reverse derivative, one graph at a time."""
-        _, (d_image, *rest) = self._pull_back(
+        _, (d_image, *gradients) = self._pull_back(
             image, goal, memory, cotangent, d_memory, numbers
         )
         d_image = to_tensor(d_image, image)
         if numbers is None:
-            return d_image, tuple(rest), None
-        *d_before, d_numbers = rest
+            return d_image, tuple(gradients), None
+        *d_before, d_numbers = gradients
         return d_image, tuple(d_before), to_tensor(d_numbers, numbers)
 
     def _pull_back(
@@ -223,8 +223,8 @@ class TorchPolicy(AbstractPolicy):
         """Return the control, and derivatives by image, memory parts and numbers."""
         rows = () if numbers is None else (to_torch(numbers),)
         self._check(image, goal, memory, *rows)
-        parts = (to_torch(image), *memory, *rows)
-        leaves = [part.detach().requires_grad_(True) for part in parts]
+        inputs = (to_torch(image), *memory, *rows)
+        leaves = [part.detach().requires_grad_(True) for part in inputs]
         end = 1 + len(memory)
         with torch.enable_grad(), self._plain_layers():
             control, after = self._evaluate(
@@ -272,13 +272,15 @@ class TorchPolicy(AbstractPolicy):
                 goals = expand_goals(goal, images)[:1]
                 pair = torch.cat([images[:1], 0.25 * images[:1]])
                 one = None if numbers is None else numbers[:1]
-                parts = [
+                first_states = [
                     (part.narrow(axis, 0, 1), axis)
                     for part, axis in zip(memory, self._axes(), strict=True)
                 ]
 
                 def evaluate(count: int) -> torch.Tensor:
-                    hidden = (torch.cat([part] * count, axis) for part, axis in parts)
+                    hidden = (
+                        torch.cat([part] * count, axis) for part, axis in first_states
+                    )
                     rows = None if one is None else one.expand(count, -1)
                     several = goals.expand(count)
                     return self._evaluate(pair[:count], several, tuple(hidden), rows)[0]
@@ -312,16 +314,16 @@ class TorchPolicy(AbstractPolicy):
         memory = tuple(part.to(image) for part in memory)
         numbers = None if numbers is None else numbers.to(image)
         # Images, of each camera its own stack of frames
-        seen, stacks = {}, []
+        frames, stacks = {}, []
         for index, (name, picture) in enumerate(self.inputs.pictures(image).items()):
             planes = self.preprocess.transform(picture)
             past = self._past(planes, memory, index)
-            seen[name], past = self.preprocess.stack(planes, past)
+            frames[name], past = self.preprocess.stack(planes, past)
             stacks.append(past)
         stacks, hidden = stacks[: self._stacks], memory[self._stacks :]
         # Network
         goals = self.goal.arguments(expand_goals(goal, image), image)
-        arguments = self.inputs.arguments(seen, goals, numbers)
+        arguments = self.inputs.arguments(frames, goals, numbers)
         outputs = call_module(self.module, self.name, *arguments, *hidden)
         # Controls
         speed = None

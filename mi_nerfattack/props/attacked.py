@@ -158,8 +158,8 @@ def read_box(
         InputError: the folder holds no finished attack, no such object, or one that is
             no box; or several are, and none is named.
     """
-    (found,) = read_found([run])
-    names = [item.id for item in found.scenario.objects]
+    (attack,) = read_found([run])
+    names = [item.id for item in attack.scenario.objects]
     if name is not None and name not in names:
         raise InputError(f"--box: {name!r}; {run} has {', '.join(names)}")
     fields = {n: load_grid(object_path(run, n)) for n in ([name] if name else names)}
@@ -169,25 +169,25 @@ def read_box(
     }
     boxes = [n for n, share in shares.items() if share >= _FLAT]
     if not boxes:
-        told = ", ".join(f"{n} to {100 * share:.0f} %" for n, share in shares.items())
+        text = ", ".join(f"{n} to {100 * share:.0f} %" for n, share in shares.items())
         raise InputError(
-            f"{run}: no box was attacked: its sides are surface, of {told}; only boxes "
+            f"{run}: no box was attacked: its sides are surface, of {text}; only boxes "
             "can be folded, shown and projected: attack one of 'mi-nerfattack asset "
             "cube', bundled:cube/field.safetensors, or a billboard or patch"
         )
     if len(boxes) > 1:
         raise InputError(f"--box: is missing; {run} has {', '.join(boxes)}")
-    poses, views = placed(found)
+    poses, views = placed(attack)
     number, field = names.index(boxes[0]), fields[boxes[0]]
-    moved = poses[number].moved(found.offsets[number])
+    moved = poses[number].moved(attack.offsets[number])
     lower, upper, images = box_pictures(field, texture_px)
     sheet = None
     if FLAT in field.info:
         (sheet,) = (k for k, v in FACES.items() if v == FLAT_FACES[field.info[FLAT]])
     box = AttackedBox(
         name=boxes[0],
-        run=found.label,
-        digest=found.digest,
+        run=attack.label,
+        digest=attack.digest,
         lower=lower,
         upper=upper,
         pose=moved,
@@ -217,8 +217,8 @@ def seen_most(box: AttackedBox, views: Views) -> str:
         points = (corner + grid).reshape(-1, 3)
         area = np.cross(down, across) / len(points)  # outward
         for matrix in matrices:
-            seen = (points - matrix[:3, 3]) @ matrix[:3, :3]
-            _, inside = project(views.camera, seen, 0.1)
+            camera_points = (points - matrix[:3, 3]) @ matrix[:3, :3]
+            _, inside = project(views.camera, camera_points, 0.1)
             away = matrix[:3, 3] - points[inside]
             facing = np.maximum(away @ area, 0)
             angles[face] += float((facing / np.linalg.norm(away, axis=1) ** 3).sum())
@@ -231,9 +231,9 @@ def seen_most(box: AttackedBox, views: Views) -> str:
     return best
 
 
-def placed(found: FoundAttack) -> tuple[list[Pose], Views]:
+def placed(attack: FoundAttack) -> tuple[list[Pose], Views]:
     """Return where the scenario puts its objects, and where they were seen from."""
-    scenario = found.scenario
+    scenario = attack.scenario
     rig = scenario.rig()
     camera, mount = rig.cameras[0], rig.mounts[0]
     if scenario.scene.surrogate is None:
@@ -244,7 +244,7 @@ def placed(found: FoundAttack) -> tuple[list[Pose], Views]:
         poses = [posed.pose for posed in sensor.objects]
     driven = [
         drive.poses
-        for drive in read_drives(found.folder / DRIVES)
+        for drive in read_drives(attack.folder / DRIVES)
         if (drive.environment, drive.case) == (SURROGATE, ATTACK)
     ]
     states = np.concatenate([np.zeros((0, 3)), *driven])

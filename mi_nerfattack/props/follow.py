@@ -95,12 +95,12 @@ def seen_faces(
     facing = np.cross(standing.down, standing.right)
     if (eye - standing.middle) @ facing <= 0:
         return {}
-    to_pixels, found = np.linalg.inv(standing.rays(eye)), {}
+    to_pixels, matrices = np.linalg.inv(standing.rays(eye)), {}
     for face in box.faces:
         corner, across, down = box.plane(face)
         if (eye - corner) @ np.cross(down, across) > 0:
-            found[face] = to_pixels @ np.stack([across, down, corner - eye], axis=1)
-    return found
+            matrices[face] = to_pixels @ np.stack([across, down, corner - eye], axis=1)
+    return matrices
 
 
 def follow_page(

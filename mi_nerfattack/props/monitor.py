@@ -86,8 +86,8 @@ def screen_image(
         InputError: it is larger than the screen, has no pixel, or a level of the
             background is out of range.
     """
-    for given, most in zip(size_mm, screen.size_mm, strict=True):
-        if not 0 < given <= most:
+    for edge_mm, most in zip(size_mm, screen.size_mm, strict=True):
+        if not 0 < edge_mm <= most:
             wide, high = screen.size_mm
             share = min(wide / size_mm[0], high / size_mm[1])
             edge = math.floor(10 * share * (longest_mm or max(size_mm))) / 10

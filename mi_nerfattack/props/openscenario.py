@@ -45,20 +45,20 @@ def write_openscenario(run: Path, folder: Path) -> list[Path]:
     Raises:
         InputError: the folder holds no finished attack, or an object is nowhere opaque.
     """
-    (found,) = read_found([run])
-    poses, _ = placed(found)
+    (attack,) = read_found([run])
+    poses, _ = placed(attack)
     files.make_folder(folder)
     written, objects = [folder / "scenario.xosc", folder / "route.xodr"], []
     for item, pose, offset in zip(
-        found.scenario.objects, poses, found.offsets, strict=True
+        attack.scenario.objects, poses, attack.offsets, strict=True
     ):
         mesh = field_surface(load_grid(object_path(run, item.id)))
         mesh = replace(mesh, vertices=pose.scale * mesh.vertices)
         written.append(folder / f"{item.id}.glb")
         write_glb(written[-1], mesh)
         objects.append((item.id, pose.moved(offset), mesh.vertices))
-    _write(written[0], _scenario(found, objects))
-    _write(written[1], _road(found.route))
+    _write(written[0], _scenario(attack, objects))
+    _write(written[1], _road(attack.route))
     return written
 
 
@@ -75,11 +75,11 @@ def _write(path: Path, root: Element) -> None:
 
 
 def _scenario(
-    found: FoundAttack, objects: list[tuple[str, Pose, np.ndarray]]
+    attack: FoundAttack, objects: list[tuple[str, Pose, np.ndarray]]
 ) -> Element:
     """Return the document; objects are id, pose and vertices (n, 3) in metres."""
-    scenario, route = found.scenario, found.route
-    start = _worst_start(found)
+    scenario, route = attack.scenario, attack.route
+    start = _worst_start(attack)
     entities = [
         _node("ScenarioObject", _car(scenario.vehicle.car(), route), name="ego")
     ]
@@ -99,7 +99,7 @@ def _scenario(
         heading, pitch, roll = Rotation.from_matrix(pose.rotation).as_euler("ZYX")
         where = _world(*pose.translation, h=heading, p=pitch, r=roll)
         actions.append(_node("Private", _teleport(where), entityRef=name))
-    end_s = found.horizon * scenario.vehicle.dt_s
+    end_s = attack.horizon * scenario.vehicle.dt_s
     time = _node("SimulationTimeCondition", value=end_s, rule="greaterThan")
     over = _node(
         "Condition",
@@ -114,7 +114,7 @@ def _scenario(
             "FileHeader",
             author="mi-nerfattack",
             date=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-            description=f"{scenario.name}, run {found.label}, {found.digest[:16]}",
+            description=f"{scenario.name}, run {attack.label}, {attack.digest[:16]}",
             revMajor=1,
             revMinor=2,
         ),
@@ -130,15 +130,15 @@ def _scenario(
     )
 
 
-def _worst_start(found: FoundAttack) -> np.ndarray:
+def _worst_start(attack: FoundAttack) -> np.ndarray:
     """Return x, y and heading of the start whose drive left the lane most."""
     drives = [
         drive
-        for drive in read_drives(found.folder / DRIVES)
+        for drive in read_drives(attack.folder / DRIVES)
         if (drive.environment, drive.case) == (SURROGATE, ATTACK)
     ]
     if not drives:
-        return found.route.pose_at(found.scenario.drive.start_m)
+        return attack.route.pose_at(attack.scenario.drive.start_m)
     return max(drives, key=lambda drive: np.abs(drive.cross_track_m).max()).poses[0]
 
 

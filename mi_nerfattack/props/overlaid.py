@@ -22,7 +22,7 @@ from mi_nerfattack.props.overlay import Overlay
 from mi_nerfattack.render.camera.intrinsics import CameraMount, camera_to_body
 from mi_nerfattack.render.camera.pose import poses_at
 
-_KEPT = 64  # poses: a second and more of most trackers
+_MAX_POSES = 64  # poses: a second and more of most trackers
 
 
 class OverlaidCamera(AbstractCamera):
@@ -53,7 +53,7 @@ class OverlaidCamera(AbstractCamera):
         self._inner, self._overlay = camera, overlay
         self._tracker, self._body = tracker, body
         self._to_body = camera_to_body(mount)
-        self._poses: deque[TrackedPose] = deque(maxlen=_KEPT)
+        self._poses: deque[TrackedPose] = deque(maxlen=_MAX_POSES)
         self._frame: Frame | None = None
 
     def newest(self) -> Frame | None:

@@ -218,13 +218,13 @@ class Overlay:
         """Return the rows and columns that faces can be in, None for none of them."""
         if not faces:
             return None
-        whole = slice(0, self.camera.height), slice(0, self.camera.width)
+        full = slice(0, self.camera.height), slice(0, self.camera.width)
         corners = np.concatenate([_corners(matrix) for matrix in faces.values()])
         if (corners[:, 2] <= 0).all():
             return None
         if (corners[:, 2] < 1e-3).any():
-            return whole
-        spots, found = corners[:, :2] / corners[:, 2:], []
+            return full
+        spots, slices = corners[:, :2] / corners[:, 2:], []
         for low, high, (least, most), focal in zip(
             spots.min(0),
             spots.max(0),
@@ -232,24 +232,24 @@ class Overlay:
             (self.camera.fx, self.camera.fy),
             strict=True,
         ):
-            seen = np.flatnonzero(
+            pixels = np.flatnonzero(
                 (most >= low - 2 / focal) & (least <= high + 2 / focal)
             )
-            if not len(seen):
+            if not len(pixels):
                 return None
-            found.append(slice(int(seen[0]), int(seen[-1]) + 1))
-        return found[1], found[0]
+            slices.append(slice(int(pixels[0]), int(pixels[-1]) + 1))
+        return slices[1], slices[0]
 
     def _reduced(self, image: np.ndarray) -> list[np.ndarray]:
         """Return a picture in linear light and halves of it, down to some pixels."""
-        found = [_TO_LINEAR[image]]
-        while min(found[-1].shape[:2]) >= 8:
-            height, width = found[-1].shape[:2]
+        pyramid = [_TO_LINEAR[image]]
+        while min(pyramid[-1].shape[:2]) >= 8:
+            height, width = pyramid[-1].shape[:2]
             size = width // 2, height // 2
-            found.append(
-                self._cv2.resize(found[-1], size, interpolation=self._cv2.INTER_AREA)
+            pyramid.append(
+                self._cv2.resize(pyramid[-1], size, interpolation=self._cv2.INTER_AREA)
             )
-        return found
+        return pyramid
 
 
 def green_share(frame: np.ndarray) -> np.ndarray:
@@ -269,11 +269,11 @@ def green_share(frame: np.ndarray) -> np.ndarray:
 
 def _keyed(under: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cut a coverage to green pixels, and take the green spill from what it covers."""
-    kept = share * green_share(under.astype(np.float32))
+    coverage = share * green_share(under.astype(np.float32))
     under = under.copy()
     others = np.maximum(under[..., 0], under[..., 2])
     np.minimum(under[..., 1], others, out=under[..., 1], where=share > 0)
-    return kept, under
+    return coverage, under
 
 
 def _half(distance: np.ndarray, across: float, down: float) -> np.ndarray:

@@ -50,10 +50,10 @@ class Tile:
     @property
     def name(self) -> str:
         """Column as a letter, row from 1, from the top left: B3."""
-        letters, rest = "", self.column
-        while rest >= 0:
-            letters = chr(ord("A") + rest % 26) + letters
-            rest = rest // 26 - 1
+        letters, number = "", self.column
+        while number >= 0:
+            letters = chr(ord("A") + number % 26) + letters
+            number = number // 26 - 1
         return f"{letters}{self.row + 1}"
 
 
@@ -146,9 +146,9 @@ def write_net(
     net = Net(edges_mm, box.sheet)
     sheets = lay_out(net, paper)
     total = len(sheets.tiles) + (len(sheets.tiles) > 1)
-    about = {"Title": f"{box.name}, run {box.run}", "CreationDate": None}
+    metadata = {"Title": f"{box.name}, run {box.run}", "CreationDate": None}
     buffer = io.BytesIO()
-    with matplotlib.rc_context(RC), PdfPages(buffer, metadata=about) as pdf:
+    with matplotlib.rc_context(RC), PdfPages(buffer, metadata=metadata) as pdf:
         for done, page in enumerate(pages(box, net, sheets, edges_mm, dpi), 1):
             pdf.savefig(page)
             on_page(done, total)
@@ -161,18 +161,18 @@ def pages(
 ) -> Iterator[Figure]:
     """Draw the pages; of several, one before them shows how they lie."""
     edges = " x ".join(f"{edge:.1f}" for edge in edges_mm)
-    about = (
+    description = (
         f"{box.name}, run {box.run}, digest {box.digest[:16]}; edges {edges} mm, "
         f"{dpi} dpi, sRGB"
     )
     if len(sheets.tiles) > 1:
-        yield _overview(box, net, sheets, about)
+        yield _overview(box, net, sheets, description)
     for tile in sheets.tiles:
-        yield _page(box, net, sheets, tile, dpi, about)
+        yield _page(box, net, sheets, tile, dpi, description)
 
 
 def _page(
-    box: AttackedBox, net: Net, sheets: Sheets, tile: Tile, dpi: int, about: str
+    box: AttackedBox, net: Net, sheets: Sheets, tile: Tile, dpi: int, description: str
 ) -> Figure:
     part = tile.part
     place = Rectangle(_MARGIN, _MARGIN + _FOOTER, part.width, part.height)
@@ -186,21 +186,21 @@ def _page(
     _draw_lines(axes, net)
     _mark_neighbours(figure, sheets, tile, place)
     where = f"page {tile.name} of A1 to {_last(sheets)}; " * (len(sheets.tiles) > 1)
-    _foot(figure, sheets, f"{where}faces: {', '.join(shown) or 'none'}", about)
+    _foot(figure, sheets, f"{where}faces: {', '.join(shown) or 'none'}", description)
     return figure
 
 
 def _paint(
-    axes: Any, image: np.ndarray, whole: Rectangle, part: Rectangle, dpi: int
+    axes: Any, image: np.ndarray, rectangle: Rectangle, part: Rectangle, dpi: int
 ) -> None:
     """Show the part of a picture that lies on a page, at the page's resolution."""
     height, width = image.shape[:2]
-    scale_x, scale_y = width / whole.width, height / whole.height
+    scale_x, scale_y = width / rectangle.width, height / rectangle.height
     source = (
-        max(0.0, (part.left - whole.left) * scale_x),
-        max(0.0, (whole.top - part.top) * scale_y),
-        min(float(width), (part.right - whole.left) * scale_x),
-        min(float(height), (whole.top - part.bottom) * scale_y),
+        max(0.0, (part.left - rectangle.left) * scale_x),
+        max(0.0, (rectangle.top - part.top) * scale_y),
+        min(float(width), (part.right - rectangle.left) * scale_x),
+        min(float(height), (rectangle.top - part.bottom) * scale_y),
     )
     across, down = (max(1, round(e / MM * dpi)) for e in (part.width, part.height))
     pixels = Image.fromarray(image).resize(
@@ -269,11 +269,11 @@ def _mark_neighbours(
             spans = (place.left - tick, place.left), (place.right, place.right + tick)
             for low, high in spans:
                 _line(figure, sheets, (low, high), (y, y))
-            about = f"cut or lay on {other}"
-            _text(figure, sheets, place.left - 4, y + 1, about, rotation=90)
+            note = f"cut or lay on {other}"
+            _text(figure, sheets, place.left - 4, y + 1, note, rotation=90)
 
 
-def _foot(figure: Figure, sheets: Sheets, where: str, about: str) -> None:
+def _foot(figure: Figure, sheets: Sheets, where: str, description: str) -> None:
     """Draw a ruler of 100 mm and the small print."""
     base = _MARGIN + 3
     _line(figure, sheets, (_MARGIN, _MARGIN + 100), (base, base))
@@ -283,15 +283,15 @@ def _foot(figure: Figure, sheets: Sheets, where: str, about: str) -> None:
     note = "100 mm: measure; print at 100 %, not fitted to the page"
     _text(figure, sheets, _MARGIN, _MARGIN - 0.5, note)
     _text(figure, sheets, _MARGIN + 104, _MARGIN + 3.5, where)
-    _text(figure, sheets, _MARGIN + 104, _MARGIN - 0.5, about)
+    _text(figure, sheets, _MARGIN + 104, _MARGIN - 0.5, description)
 
 
-def _overview(box: AttackedBox, net: Net, sheets: Sheets, about: str) -> Figure:
+def _overview(box: AttackedBox, net: Net, sheets: Sheets, description: str) -> Figure:
     """Show the whole net, reduced, with the names of faces and pages."""
-    parts = [tile.part for tile in sheets.tiles]
-    left, bottom = min(p.left for p in parts), min(p.bottom for p in parts)
-    width = max(p.right for p in parts) - left
-    height = max(p.top for p in parts) - bottom
+    rectangles = [tile.part for tile in sheets.tiles]
+    left, bottom = min(p.left for p in rectangles), min(p.bottom for p in rectangles)
+    width = max(p.right for p in rectangles) - left
+    height = max(p.top for p in rectangles) - bottom
     room = sheets.width - 2 * _MARGIN, sheets.height - 2 * _MARGIN - _FOOTER
     scale = min(room[0] / width, room[1] / height)
     place = Rectangle(_MARGIN, _MARGIN + _FOOTER, scale * width, scale * height)
@@ -302,9 +302,9 @@ def _overview(box: AttackedBox, net: Net, sheets: Sheets, about: str) -> Figure:
         axes.imshow(
             np.asarray(small), extent=extent, interpolation="none", aspect="auto"
         )
-        middle = spot.left + spot.width / 2, spot.bottom + spot.height / 2
+        x, y = spot.left + spot.width / 2, spot.bottom + spot.height / 2
         frame = {"facecolor": "white", "linewidth": 0, "pad": 1}
-        axes.text(*middle, face, fontsize=8, ha="center", va="center", bbox=frame)
+        axes.text(x, y, face, fontsize=8, ha="center", va="center", bbox=frame)
     for tile in sheets.tiles:
         part = tile.part
         xs = [part.left, part.right, part.right, part.left, part.left]
@@ -313,7 +313,7 @@ def _overview(box: AttackedBox, net: Net, sheets: Sheets, about: str) -> Figure:
         axes.text(part.left, part.top, f" {tile.name}", fontsize=6, va="top")
     count = len(sheets.tiles)
     where = f"reduced: how {count} pages, A1 to {_last(sheets)}, lie side by side"
-    _foot(figure, sheets, where, about)
+    _foot(figure, sheets, where, description)
     return figure
 
 

@@ -295,8 +295,8 @@ def open_rehearsal(
 ) -> Iterator[Rig]:
     """Open the simulated devices; arguments as of `open_rig`."""
     place = bundled_place("room")
-    seen, mount = trained.camera or place.camera, trained.mount or place.mount
-    place = replace(place, camera=seen, mount=mount)
+    lens, mount = trained.camera or place.camera, trained.mount or place.mount
+    place = replace(place, camera=lens, mount=mount)
     room = SimulatedRoom(config.car, route.pose_at(0.0))
     tracker, motor = SimulatedTracker(room), SimulatedMotor(room)
     with closing(simulated_camera(room, place, config.spp)) as camera, closing(motor):

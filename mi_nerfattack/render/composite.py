@@ -24,7 +24,7 @@ from mi_nerfattack.render.scene_march import AbstractSceneMarch, scene_march
 
 
 @dataclass
-class Seen:
+class Marches:
     """What a composite gives.
 
     Attributes:
@@ -35,9 +35,9 @@ class Seen:
     total: March = field(default_factory=March)
     layers: list[March] = field(default_factory=list)
 
-    def copy(self) -> Seen:
+    def copy(self) -> Marches:
         """Return the same values with no derivatives attached."""
-        return Seen(self.total.copy(), [layer.copy() for layer in self.layers])
+        return Marches(self.total.copy(), [layer.copy() for layer in self.layers])
 
 
 class AbstractComposite(ABC):
@@ -52,7 +52,7 @@ class AbstractComposite(ABC):
         del posed
 
     @abstractmethod
-    def render(self, posed: Sequence[Layer], rays: Rays, stop: float) -> Seen:
+    def render(self, posed: Sequence[Layer], rays: Rays, stop: float) -> Marches:
         """March rays through layers.
 
         Args:
@@ -66,15 +66,15 @@ class AbstractComposite(ABC):
         self,
         posed: Sequence[Layer],
         rays: Rays,
-        seen: Seen,
+        primal: Marches,
         stop: float,
-    ) -> Seen:
+    ) -> Marches:
         """Return tangents of what was seen, from tangents of the fields' parameters.
 
         Args:
             posed: as given to :meth:`render`.
             rays: as given to :meth:`render`.
-            seen: what :meth:`render` returned.
+            primal: what :meth:`render` returned.
             stop: as given to :meth:`render`.
         """
 
@@ -90,26 +90,26 @@ class AbstractComposite(ABC):
         """
         del scene, stop
 
-    def shares(self, seen: Seen) -> list[March]:
+    def shares(self, marches: Marches) -> list[March]:
         """Return what of each layer reaches the camera; they add up to the total."""
-        return seen.layers
+        return marches.layers
 
     @abstractmethod
-    def keep(self, seen: Seen) -> Any:
+    def keep(self, marches: Marches) -> Any:
         """Return the part of what was seen that is costly to find again."""
 
     @abstractmethod
     def restore(
-        self, posed: Sequence[Layer], rays: Rays, kept: Any, stop: float
-    ) -> Seen:
+        self, posed: Sequence[Layer], rays: Rays, record: Any, stop: float
+    ) -> Marches:
         """Return what :meth:`render` gave, from what :meth:`keep` kept of it."""
 
     def backward(
         self,
         posed: Sequence[Layer],
         rays: Rays,
-        seen: Seen,
-        cotangent: Seen,
+        primal: Marches,
+        cotangent: Marches,
         stop: float,
     ) -> None:
         """Accumulate gradients of the parameters of the fields that ask for them.
@@ -117,17 +117,17 @@ class AbstractComposite(ABC):
         Args:
             posed: as given to :meth:`render`.
             rays: as given to :meth:`render`.
-            seen: what :meth:`render` returned.
+            primal: what :meth:`render` returned.
             cotangent: derivative of the objective by what was seen, per ray; no
                 layers where it depends on the total alone.
             stop: as given to :meth:`render`.
         """
-        for task in self.tasks(posed, rays, seen, cotangent):
+        for task in self.tasks(posed, rays, primal, cotangent):
             self.accumulate([posed[k] for k in task.fields], task, stop)
 
     @abstractmethod
     def tasks(
-        self, posed: Sequence[Layer], rays: Rays, seen: Seen, cotangent: Seen
+        self, posed: Sequence[Layer], rays: Rays, primal: Marches, cotangent: Marches
     ) -> list[Task]:
         """Say what :meth:`backward` has to march again.
 
@@ -144,25 +144,26 @@ class AbstractComposite(ABC):
         self,
         posed: Sequence[Layer],
         rays: Rays,
-        seen: Seen,
-        cotangent: Seen,
+        primal: Marches,
+        cotangent: Marches,
         stop: float,
-        wanted: Sequence[int],
+        layers: Sequence[int],
     ) -> list[RayGradient]:
         """Do what :meth:`backward` does, and differentiate by the rays.
 
         Args:
             posed: as given to :meth:`render`.
             rays: as given to :meth:`render`.
-            seen: what :meth:`render` returned.
+            primal: what :meth:`render` returned.
             cotangent: derivative of the objective by what was seen, per ray; no
                 layers where it depends on the total alone.
             stop: as given to :meth:`render`.
-            wanted: layers that matter, among them those that ask for gradients.
+            layers: indices of the layers that matter, among them those that ask for
+                gradients.
 
         Returns:
             the objective's derivatives by origin and direction, (3, n), as each of
-            the wanted layers sees them.
+            these layers sees them.
         """
 
 
@@ -174,74 +175,74 @@ class DepthComposite(AbstractComposite):
     to A.6.
     """
 
-    def render(self, posed: Sequence[Layer], rays: Rays, stop: float) -> Seen:
+    def render(self, posed: Sequence[Layer], rays: Rays, stop: float) -> Marches:
         """See :meth:`AbstractComposite.render`; a layer is the field alone."""
         layers = [_see(item, rays, stop) for item in rays.light(posed)]
-        return Seen(depth_composite(layers), layers) if layers else nothing(rays)
+        return Marches(depth_composite(layers), layers) if layers else nothing(rays)
 
     def ahead(self, scene: Layer, stop: float) -> AbstractSceneMarch | None:
         """See :meth:`AbstractComposite.ahead`."""
         return scene_march(scene, stop) if isinstance(scene, PosedField) else None
 
-    def shares(self, seen: Seen) -> list[March]:
+    def shares(self, marches: Marches) -> list[March]:
         """See :meth:`AbstractComposite.shares`."""
-        return shares_by_depth(seen.layers)
+        return shares_by_depth(marches.layers)
 
-    def keep(self, seen: Seen) -> Any:
+    def keep(self, marches: Marches) -> Any:
         """See :meth:`AbstractComposite.keep`: 20 bytes a layer and ray that meets it.
 
         A ray that meets a layer is 24 bytes where these are less than half of the rays.
         """
-        kept = [Sparse.of(layer) for layer in seen.layers]
-        dr.eval(kept)
-        return kept
+        layers = [Sparse.of(layer) for layer in marches.layers]
+        dr.eval(layers)
+        return layers
 
     def restore(
-        self, posed: Sequence[Layer], rays: Rays, kept: Any, stop: float
-    ) -> Seen:
+        self, posed: Sequence[Layer], rays: Rays, record: Any, stop: float
+    ) -> Marches:
         """See :meth:`AbstractComposite.restore`; marches the layers that are None."""
         layers = [
             _see(item, rays, stop) if layer is None else layer
-            for item, layer in zip(rays.light(posed), map(_full, kept), strict=True)
+            for item, layer in zip(rays.light(posed), map(_full, record), strict=True)
         ]
-        return Seen(depth_composite(layers), layers) if layers else nothing(rays)
+        return Marches(depth_composite(layers), layers) if layers else nothing(rays)
 
     def forward(
         self,
         posed: Sequence[Layer],
         rays: Rays,
-        seen: Seen,
+        primal: Marches,
         stop: float,
-    ) -> Seen:
+    ) -> Marches:
         """See :meth:`AbstractComposite.forward`."""
         mode, none = dr.ADMode.Forward, March()
         tangents = [
             _derive(mode, item, rays, layer, none, stop)[0]
             if item.has_gradients
             else none
-            for item, layer in zip(rays.light(posed), seen.layers, strict=True)
+            for item, layer in zip(rays.light(posed), primal.layers, strict=True)
         ]
         with dr.resume_grad():
-            leaves = [layer.copy() for layer in seen.layers]
+            leaves = [layer.copy() for layer in primal.layers]
             dr.enable_grad(leaves)
             for leaf, tangent in zip(leaves, tangents, strict=True):
                 dr.set_grad(leaf, tangent)
             total: Any = depth_composite(leaves)
-            return Seen(dr.forward_to(total, flags=dr.ADFlag.ClearEdges), tangents)
+            return Marches(dr.forward_to(total, flags=dr.ADFlag.ClearEdges), tangents)
 
     def tasks(
-        self, posed: Sequence[Layer], rays: Rays, seen: Seen, cotangent: Seen
+        self, posed: Sequence[Layer], rays: Rays, primal: Marches, cotangent: Marches
     ) -> list[Task]:
         """See :meth:`AbstractComposite.tasks`; one for each field."""
         # From the total to each layer, through the folds
-        parts = self._cotangents(seen, cotangent)
-        dr.eval(parts)  # so that it is known how many rays have to be marched again
+        by_layer = self._cotangents(primal, cotangent)
+        dr.eval(by_layer)  # so that it is known how many rays have to be marched again
         return [
             task
             for k, item in enumerate(posed)
             if item.has_gradients
             for task in select(
-                seen.layers[k].opacity > 0, rays, seen.layers[k], parts[k], (k,)
+                primal.layers[k].opacity > 0, rays, primal.layers[k], by_layer[k], (k,)
             )
         ]
 
@@ -255,25 +256,25 @@ class DepthComposite(AbstractComposite):
         self,
         posed: Sequence[Layer],
         rays: Rays,
-        seen: Seen,
-        cotangent: Seen,
+        primal: Marches,
+        cotangent: Marches,
         stop: float,
-        wanted: Sequence[int],
+        layers: Sequence[int],
     ) -> list[RayGradient]:
         """See :meth:`AbstractComposite.backward_rays`."""
         lit = rays.light(posed)
-        fields_by_rays([lit[k] for k in wanted])
-        parts = self._cotangents(seen, cotangent)
+        fields_by_rays([lit[k] for k in layers])
+        by_layer = self._cotangents(primal, cotangent)
         mode = dr.ADMode.Backward
         return [
-            _derive(mode, lit[k], rays, seen.layers[k], parts[k], stop, True)[1]
-            for k in wanted
+            _derive(mode, lit[k], rays, primal.layers[k], by_layer[k], stop, True)[1]
+            for k in layers
         ]
 
-    def _cotangents(self, seen: Seen, cotangent: Seen) -> list[March]:
+    def _cotangents(self, primal: Marches, cotangent: Marches) -> list[March]:
         """Return the derivatives of the objective by each layer."""
         with dr.resume_grad():
-            leaves = [layer.copy() for layer in seen.layers]
+            leaves = [layer.copy() for layer in primal.layers]
             dr.enable_grad(leaves)
             result = depth_composite(leaves).pair(cotangent.total)
             for leaf, part in zip(leaves, cotangent.layers, strict=False):
@@ -282,9 +283,9 @@ class DepthComposite(AbstractComposite):
             return [dr.grad(leaf) for leaf in leaves]
 
 
-def nothing(rays: Rays) -> Seen:
+def nothing(rays: Rays) -> Marches:
     """Return what is seen of no layers."""
-    return Seen(dr.zeros(March, dr.width(rays.direction)), [])
+    return Marches(dr.zeros(March, dr.width(rays.direction)), [])
 
 
 def _full(layer: March | Sparse | None) -> March | None:
@@ -300,21 +301,21 @@ def _see(item: Layer, rays: Rays, stop: float) -> March:
 @dr.syntax
 def _march_where_it_is(posed: PosedField, rays: Rays, stop: float) -> March:
     """March; a vector of rays of which none meets the field's box does nothing."""
-    found = March()
+    layer = March()
     with dr.suspend_grad():
         o, d = posed.to_local(rays.origin, rays.direction)
         near, far = posed.interval(o, d, rays.t_max)
         if rays.active & (near < far):
-            found = march(posed, rays, stop)
-    return found
+            layer = march(posed, rays, stop)
+    return layer
 
 
 def _derive(
-    mode: dr.ADMode, item: Layer, rays: Rays, *more: Any
+    mode: dr.ADMode, item: Layer, rays: Rays, *arguments: Any
 ) -> tuple[March, RayGradient]:
     if isinstance(item, AbstractBackdrop):
-        return item.derivative(mode, rays, *more)
-    return march_derivative(mode, item, rays, *more)
+        return item.derivative(mode, rays, *arguments)
+    return march_derivative(mode, item, rays, *arguments)
 
 
 def depth_composite(layers: list[March]) -> March:

@@ -19,7 +19,7 @@ from mi_nerfattack.render.backdrop import Layer, fields_by_rays, only_fields
 from mi_nerfattack.render.composite import (
     AbstractComposite,
     DepthComposite,
-    Seen,
+    Marches,
     nothing,
 )
 from mi_nerfattack.render.march import (
@@ -49,60 +49,68 @@ class InterleavedComposite(AbstractComposite):
         """See :meth:`AbstractComposite.check`."""
         _fields(posed)
 
-    def render(self, posed: Sequence[Layer], rays: Rays, stop: float) -> Seen:
+    def render(self, posed: Sequence[Layer], rays: Rays, stop: float) -> Marches:
         """See :meth:`AbstractComposite.render`."""
         lit = rays.light(_fields(posed))
         if not lit:
             return nothing(rays)
         if len(lit) == 1:  # nothing to merge
             share = march(lit[0], rays, stop)
-            return Seen(share, [share])
+            return Marches(share, [share])
         with dr.suspend_grad():
             walk, active = MergedWalk.start(lit, rays)
-            looks = [item.eval for item in lit], [path.heading for path in walk.paths]
-            shares = integrate(lit, walk, active, *looks, stop).shares
-        return Seen(_total(shares), shares)
+            shares = integrate(
+                lit,
+                walk,
+                active,
+                evaluate=[item.eval for item in lit],
+                towards=[path.heading for path in walk.paths],
+                stop=stop,
+            ).shares
+        return Marches(_total(shares), shares)
 
-    def keep(self, seen: Seen) -> Any:
+    def keep(self, marches: Marches) -> Any:
         """See :meth:`AbstractComposite.keep`: all, 20 + 20 k bytes a ray."""
-        return seen
+        return marches
 
     def restore(
-        self, posed: Sequence[Layer], rays: Rays, kept: Any, stop: float
-    ) -> Seen:
+        self, posed: Sequence[Layer], rays: Rays, record: Any, stop: float
+    ) -> Marches:
         """See :meth:`AbstractComposite.restore`."""
         del posed, rays, stop
-        return kept
+        return record
 
     def forward(
         self,
         posed: Sequence[Layer],
         rays: Rays,
-        seen: Seen,
+        primal: Marches,
         stop: float,
-    ) -> Seen:
+    ) -> Marches:
         """See :meth:`AbstractComposite.forward`; of several fields, of the total."""
         fields, mode = _fields(posed), dr.ADMode.Forward
         total = March()
         if any(item.has_gradients for item in fields):
             with dr.suspend_grad():
-                total, _ = _replay(mode, fields, rays, seen.total, March(), stop, False)
-        return Seen(total, [total] if len(fields) == 1 else [])
+                total, _ = _replay(
+                    mode, fields, rays, primal.total, March(), stop, False
+                )
+        return Marches(total, [total] if len(fields) == 1 else [])
 
     def tasks(
-        self, posed: Sequence[Layer], rays: Rays, seen: Seen, cotangent: Seen
+        self, posed: Sequence[Layer], rays: Rays, primal: Marches, cotangent: Marches
     ) -> list[Task]:
         """See :meth:`AbstractComposite.tasks`; one, which needs all fields."""
         met = [
             layer.opacity > 0
-            for item, layer in zip(posed, seen.layers, strict=True)
+            for item, layer in zip(posed, primal.layers, strict=True)
             if item.has_gradients
         ]
         if not met:
             return []
-        wanted = reduce(operator.or_, met)
-        whole = _whole(seen, cotangent)
-        return select(wanted, rays, seen.total, whole, tuple(range(len(posed))))
+        mask = reduce(operator.or_, met)
+        d_total = _total_cotangent(primal, cotangent)
+        return select(mask, rays, primal.total, d_total, tuple(range(len(posed))))
 
     def accumulate(self, posed: Sequence[Layer], task: Task, stop: float) -> None:
         """See :meth:`AbstractComposite.accumulate`."""
@@ -118,18 +126,18 @@ class InterleavedComposite(AbstractComposite):
         self,
         posed: Sequence[Layer],
         rays: Rays,
-        seen: Seen,
-        cotangent: Seen,
+        primal: Marches,
+        cotangent: Marches,
         stop: float,
-        wanted: Sequence[int],
+        layers: Sequence[int],
     ) -> list[RayGradient]:
         """See :meth:`AbstractComposite.backward_rays`; always evaluates all fields."""
-        fields_by_rays([posed[k] for k in wanted])
+        fields_by_rays([posed[k] for k in layers])
         fields, mode = _fields(posed), dr.ADMode.Backward
         with dr.suspend_grad(), private_gradients():
-            whole = _whole(seen, cotangent)
-            by_field = _replay(mode, fields, rays, seen.total, whole, stop, True)[1]
-        return [by_field[k] for k in wanted]
+            d_total = _total_cotangent(primal, cotangent)
+            by_field = _replay(mode, fields, rays, primal.total, d_total, stop, True)[1]
+        return [by_field[k] for k in layers]
 
 
 COMPOSITES: dict[str, type[AbstractComposite]] = {
@@ -143,13 +151,13 @@ def _fields(posed: Sequence[Layer]) -> list[PosedField]:
     return only_fields(posed, purpose, "set composite to depth")
 
 
-def _whole(seen: Seen, cotangent: Seen) -> March:
+def _total_cotangent(primal: Marches, cotangent: Marches) -> March:
     """Return the cotangent of the total; that of a single layer is part of it.
 
     Raises:
         InputError: one of several layers has a cotangent.
     """
-    if len(seen.layers) == 1 and cotangent.layers:
+    if len(primal.layers) == 1 and cotangent.layers:
         return cotangent.total.plus(cotangent.layers[0], mi.Bool(True))
     if any(dr.any(layer.differs()) for layer in cotangent.layers):
         raise InputError(

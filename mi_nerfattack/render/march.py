@@ -45,7 +45,7 @@ import mitsuba as mi
 
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
-from mi_nerfattack.render.sums import Rest, Sums
+from mi_nerfattack.render.sums import Remainder, Sums
 from mi_nerfattack.render.walk import MergedWalk, Path, Segment, Walk
 
 STOP = 1e-6
@@ -106,7 +106,7 @@ def march_derivative(  # noqa: D417  one entry describes three
 
     With ``w_k`` the weight and ``T_k+1`` the transmittance behind sample k:
     ``dI/dL_k = w_k``, ``dI/dsigma_k = width_k (T_k+1 L_k - sum_{j>k} w_j L_j)``. The
-    opacity and the moment have derivatives of the same form; `sums.Rest` names the
+    opacity and the moment have derivatives of the same form; `sums.Remainder` names the
     terms. Parameters of the field (and nothing else) get their derivatives through
     Dr.Jit's graph: in backward mode they are accumulated into ``dr.grad`` of every
     parameter with gradients enabled; in forward mode they are read from there.
@@ -128,8 +128,16 @@ def march_derivative(  # noqa: D417  one entry describes three
     """
     with dr.suspend_grad(), private_gradients():
         walk, active = Walk.start(posed, rays)
-        fixed = [posed], walk, active, primal, cotangent, stop
-        tangent, (by_rays,) = replay(mode, *fixed, with_rays)
+        tangent, (by_rays,) = replay(
+            mode,
+            [posed],
+            walk,
+            active=active,
+            primal=primal,
+            cotangent=cotangent,
+            stop=stop,
+            with_rays=with_rays,
+        )
     return tangent, by_rays
 
 
@@ -156,13 +164,13 @@ def integrate(
     sums = Sums.zeros(len(posed))
     while active:
         # The next lattice interval in an occupied cell, and one sample in it
-        walk, here = walk.next(posed, active)
-        points = [path.at(here.t) for path in walk.paths]
-        densities, colours = _evaluate(evaluate, points, towards, here)
+        walk, segment = walk.next(posed, active)
+        points = [path.at(segment.t) for path in walk.paths]
+        densities, colours = _evaluate(evaluate, points, towards, segment)
         # A.1 to A.3 as sums: T phi(x) x L, and the same of 1 and of t
-        sums = sums.plus(here.depths(densities), colours, here.t)
+        sums = sums.plus(segment.depths(densities), colours, segment.t)
         # Behind transmittance `stop`, nothing is seen
-        active = here.active & (dr.exp(-sums.tau) > stop)
+        active = segment.active & (dr.exp(-sums.tau) > stop)
     return sums
 
 
@@ -184,16 +192,16 @@ class RayGradient:
     log_density: mi.Float = field(default_factory=lambda: mi.Float(0))
 
     def plus(
-        self, point: Any, heading: Any, growth: mi.Float, here: Segment
+        self, point: Any, heading: Any, growth: mi.Float, segment: Segment
     ) -> RayGradient:
         """Add what a sample's point and heading got, and its `Slope.growth`."""
-        by_point = dr.select(here.active, mi.Vector3f(dr.grad(point)), 0)
-        by_heading = dr.select(here.active, dr.grad(heading), 0)
+        by_point = dr.select(segment.active, mi.Vector3f(dr.grad(point)), 0)
+        by_heading = dr.select(segment.active, dr.grad(heading), 0)
         return RayGradient(
             self.origin + by_point,
-            self.direction + here.t * by_point,
+            self.direction + segment.t * by_point,
             self.heading + by_heading,
-            self.log_density + dr.select(here.active, growth, 0),
+            self.log_density + dr.select(segment.active, growth, 0),
         )
 
     def in_world(self, posed: PosedField, path: Path) -> RayGradient:
@@ -230,34 +238,38 @@ def replay(  # noqa: D417  one entry describes four
         as :func:`march_derivative`, the derivatives by rays for each field.
     """
     count = range(len(posed))
-    # Replay: `rest` starts as all that the rays gathered, and loses each sample's part
-    rest, tangent = Rest.of(primal), March()
+    # Replay: `remainder` starts as all that the rays gathered, and loses the part of
+    # each sample
+    remainder, tangent = Remainder.of(primal), March()
     by_rays = [RayGradient() for _ in posed]
     while active:
-        walk, here = walk.next(posed, active)
+        walk, segment = walk.next(posed, active)
         with dr.resume_grad():
             # The fields again at the sample, attached to their parameters
-            points, headings = _attach(walk.paths, here.t, with_rays)
+            points, headings = _attach(walk.paths, segment.t, with_rays)
             densities, colours = _evaluate(
-                [item.eval for item in posed], points, headings, here
+                [item.eval for item in posed], points, headings, segment
             )
-            # dI/dL = w, dI/dsigma = width (T L - what is behind): see `sums.Rest.minus`
-            depths = here.depths(densities)
-            rest, slope = rest.minus(dr.detach(depths), dr.detach(colours), here.t)
+            # dI/dL = w, dI/dsigma = width (T L - what is behind): see
+            # `sums.Remainder.minus`
+            depths = segment.depths(densities)
+            remainder, slope = remainder.minus(
+                dr.detach(depths), dr.detach(colours), segment.t
+            )
             change = slope.change(depths, colours)
             # From the sample to the parameters, or from the parameters to the sample
             if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
                 dr.backward_from(cotangent.pair(change))
             else:
-                tangent = tangent.plus(dr.forward_to(change), here.active)
+                tangent = tangent.plus(dr.forward_to(change), segment.active)
             # From the sample to the rays
             if dr.hint(with_rays, mode="scalar"):
                 growth = slope.growth(cotangent, dr.detach(depths), dr.detach(colours))
                 by_rays = [
-                    by_rays[k].plus(points[k], headings[k], growth[k], here)
+                    by_rays[k].plus(points[k], headings[k], growth[k], segment)
                     for k in count
                 ]
-        active = here.active & (dr.exp(-rest.tau) > stop)
+        active = segment.active & (dr.exp(-remainder.tau) > stop)
     return tangent, list(map(RayGradient.in_world, by_rays, posed, walk.paths))
 
 
@@ -265,11 +277,11 @@ def _evaluate(
     evaluate: Sequence[Evaluate],
     points: Sequence[Any],
     towards: Sequence[Any],
-    here: Segment,
+    segment: Segment,
 ) -> tuple[list, list]:
     """Evaluate all fields at a sample: their densities and their radiances."""
-    parts = zip(evaluate, points, towards, here.inside, strict=True)
-    values = [see(point, look, inside) for see, point, look, inside in parts]
+    arguments = zip(evaluate, points, towards, segment.inside, strict=True)
+    values = [see(point, look, inside) for see, point, look, inside in arguments]
     return [density for density, _ in values], [colour for _, colour in values]
 
 

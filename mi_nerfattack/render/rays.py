@@ -59,8 +59,8 @@ def pick_rays(value: Any, index: mi.UInt32) -> Any:
     if isinstance(value, list):
         return [pick_rays(item, index) for item in value]
     if is_dataclass(value):
-        parts = {item.name: getattr(value, item.name) for item in fields(value)}
-        return type(value)(**{k: pick_rays(v, index) for k, v in parts.items()})
+        attributes = {item.name: getattr(value, item.name) for item in fields(value)}
+        return type(value)(**{k: pick_rays(v, index) for k, v in attributes.items()})
     return value if dr.width(value) == 1 else dr.gather(type(value), value, index)
 
 
@@ -207,7 +207,7 @@ def shares_by_depth(layers: Sequence[March]) -> list[March]:
     Args:
         layers: one march a layer, each of n rays.
     """
-    depths, found = [layer.depth for layer in layers], []
+    depths, shares = [layer.depth for layer in layers], []
     for index, layer in enumerate(layers):
         passed = mi.Float(1)
         for other, front in enumerate(layers):
@@ -216,9 +216,9 @@ def shares_by_depth(layers: Sequence[March]) -> list[March]:
                 nearer |= depths[other] == depths[index]
             if other != index:
                 passed *= dr.select(nearer, 1 - front.opacity, 1)
-        parts = layer.radiance, layer.opacity, layer.moment
-        found.append(March(*(passed * part for part in parts)))
-    return found
+        channels = layer.radiance, layer.opacity, layer.moment
+        shares.append(March(*(passed * channel for channel in channels)))
+    return shares
 
 
 FIRST_RAYS = 1 << 13  # that tasks wait for before a launch
@@ -278,16 +278,16 @@ class TaskQueue:
 
 
 def select(
-    wanted: mi.Bool, rays: Rays, primal: March, cotangent: March, which: tuple[int, ...]
+    mask: mi.Bool, rays: Rays, primal: March, cotangent: March, which: tuple[int, ...]
 ) -> list[Task]:
     """Return the task of marching the wanted rays again; none without such rays.
 
     Rays without a cotangent are not among them.
     """
-    index = dr.compress(wanted & cotangent.differs())
+    index = dr.compress(mask & cotangent.differs())
     if not dr.width(index):
         return []
 
     gains = [rays.gains[k] for k in which] if rays.gains else []
-    parts = replace(rays, gains=gains), primal, cotangent
-    return [Task(*(pick_rays(x, index) for x in parts), fields=which)]
+    arrays = replace(rays, gains=gains), primal, cotangent
+    return [Task(*(pick_rays(x, index) for x in arrays), fields=which)]

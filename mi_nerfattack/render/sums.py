@@ -71,10 +71,10 @@ class Sums:
             t: (n,), position of the sample, metres.
         """
         x = sum(depths, mi.Float(0))
-        given = dr.exp(-self.tau) * absorption(x)[0]
+        attenuation = dr.exp(-self.tau) * absorption(x)[0]
         shares = []
         for share, depth, colour in zip(self.shares, depths, colours, strict=True):
-            w = given * depth
+            w = attenuation * depth
             march = March(
                 share.radiance + w * colour, share.opacity + w, share.moment + w * t
             )
@@ -89,7 +89,7 @@ class Sums:
 
 
 @dataclass
-class Rest:
+class Remainder:
     """What of a march is still to come, while it is replayed.
 
     Attributes:
@@ -105,34 +105,34 @@ class Rest:
     passed: mi.Float
 
     @staticmethod
-    def of(primal: March) -> Rest:
+    def of(primal: March) -> Remainder:
         """Return all of a march."""
         radiance, moment = mi.Color3f(primal.radiance), mi.Float(primal.moment)
-        return Rest(mi.Float(0), radiance, moment, 1 - primal.opacity)
+        return Remainder(mi.Float(0), radiance, moment, 1 - primal.opacity)
 
     def minus(
         self, depths: Sequence[mi.Float], colours: Sequence[mi.Color3f], t: mi.Float
-    ) -> tuple[Rest, Slope]:
+    ) -> tuple[Remainder, Slope]:
         """Take a sample away, as :meth:`Sums.plus` added it, and differentiate."""
         x = sum(depths, mi.Float(0))
         light = mix(depths, colours)
         through, behind = dr.exp(-self.tau), dr.exp(-self.tau - x)
         phi, d_phi = absorption(x)
-        given = through * phi
-        rest = Rest(
+        attenuation = through * phi
+        remainder = Remainder(
             self.tau + x,
-            self.radiance - given * light,
-            self.moment - given * x * t,
+            self.radiance - attenuation * light,
+            self.moment - attenuation * x * t,
             self.passed,
         )
         # More depth in any field dims the sample's own light, and all light behind it.
-        d_radiance = through * d_phi * light - rest.radiance
+        d_radiance = through * d_phi * light - remainder.radiance
         # It takes from what passes the whole ray in proportion.
         d_opacity = self.passed
         # All depth in the sample is at t: T x phi(x) grows by what is behind it.
-        d_moment = behind * t - rest.moment
+        d_moment = behind * t - remainder.moment
         # The field that has more depth adds light of its own: see `Slope.change`.
-        return rest, Slope(given, March(d_radiance, d_opacity, d_moment))
+        return remainder, Slope(attenuation, March(d_radiance, d_opacity, d_moment))
 
 
 @dataclass
@@ -140,11 +140,11 @@ class Slope:
     """Derivative of a march by one of its samples.
 
     Attributes:
-        given: (n,), what arrives of light that the sample emits, ``T phi(x)``.
+        attenuation: (n,), what arrives of light that the sample emits, ``T phi(x)``.
         by_depth: derivative by the optical depth of all fields, their light fixed.
     """
 
-    given: mi.Float
+    attenuation: mi.Float
     by_depth: March
 
     def change(
@@ -154,7 +154,7 @@ class Slope:
         x, by_depth = sum(depths, mi.Float(0)), self.by_depth
         light = mix(depths, colours)
         return March(
-            self.given * light + x * by_depth.radiance,
+            self.attenuation * light + x * by_depth.radiance,
             x * by_depth.opacity,
             x * by_depth.moment,
         )
@@ -175,7 +175,7 @@ class Slope:
         shared = cotangent.pair(self.by_depth)
         pairs = zip(depths, colours, strict=True)
         return [
-            x * (shared + self.given * dr.dot(colour, cotangent.radiance))
+            x * (shared + self.attenuation * dr.dot(colour, cotangent.radiance))
             for x, colour in pairs
         ]
 

@@ -65,8 +65,8 @@ class Path:
             # Density falls to 0 at the box. Whole intervals around it leave no edge
             # that would move with the ray.
             last = posed.lattice_index_after(begin, first, far)
-            whole = posed.lattice_after(begin, first, dr.ceil(last))
-            near, far = mi.Float(0), dr.minimum(whole, rays.t_max - begin)
+            end = posed.lattice_after(begin, first, dr.ceil(last))
+            near, far = mi.Float(0), dr.minimum(end, rays.t_max - begin)
         path.near, path.far = near, dr.select(meets, far, near)
         return path
 
@@ -140,10 +140,10 @@ class Walk:
         self, posed: Sequence[PosedField], active: mi.Bool
     ) -> tuple[Walk, Segment]:
         """Go on to the next interval in an occupied cell."""
-        found, t, width, active = seek(
+        index, t, width, active = seek(
             posed[0], self.paths[0], self.index, self.jitter, active
         )
-        walk = Walk(self.paths, self.jitter, found + 1)
+        walk = Walk(self.paths, self.jitter, index + 1)
         return walk, Segment(t, width, active, [active])
 
 
@@ -161,7 +161,7 @@ def seek(
     s = mi.Float(0)
     width = mi.Float(0)
     searching = mi.Bool(active)
-    found = mi.Bool(False)
+    hit = mi.Bool(False)
     while searching:
         start = dr.maximum(path.edge(posed, index), path.near)
         end = dr.minimum(path.edge(posed, index + 1), path.far)
@@ -170,13 +170,13 @@ def seek(
         searching &= (start < path.far) & (index < MAX_INTERVALS)
         unit = posed.field.unit(mi.Point3f(path.o + s * path.d))
         distance, cell = occupancy.query(unit, searching)
-        found = searching & (distance == 0)
-        searching &= ~found
+        hit = searching & (distance == 0)
+        searching &= ~hit
         rate = posed.field.unit_vector(path.d)
         leaving = s + occupancy.exit(unit, rate, cell, distance)
         jump = dr.maximum(index + 1, path.interval(posed, leaving))
         index = dr.select(searching, jump, index)
-    return index, path.begin + s, dr.maximum(width, 0), found
+    return index, path.begin + s, dr.maximum(width, 0), hit
 
 
 @dataclass
@@ -205,11 +205,11 @@ class Cursor:
     ) -> Cursor:
         """Move on to the next occupied interval where the present one lies behind t."""
         spent = active & (self.end <= t)
-        index, _, _, found = seek(posed, path, self.following, jitter, spent)
+        index, _, _, hit = seek(posed, path, self.following, jitter, spent)
         start = dr.maximum(path.edge(posed, index), path.near) + path.begin
         end = dr.minimum(path.edge(posed, index + 1), path.far) + path.begin
         end = dr.maximum(end, start)
-        start, end = dr.select(found, start, dr.inf), dr.select(found, end, dr.inf)
+        start, end = dr.select(hit, start, dr.inf), dr.select(hit, end, dr.inf)
         return Cursor(
             dr.select(spent, index + 1, self.following),
             dr.select(spent, start, self.start),
@@ -279,8 +279,8 @@ def sample_count(posed: PosedField, rays: Rays) -> mi.Float:
     walk, active = Walk.start(posed, rays)
     count = mi.Float(0)
     while active:
-        walk, here = walk.next([posed], active)
-        active = here.active
+        walk, segment = walk.next([posed], active)
+        active = segment.active
         count += dr.select(active, 1.0, 0.0)
     return count
 
@@ -297,9 +297,9 @@ class Range:
     lower: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(dr.inf))
     upper: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(-dr.inf))
 
-    def around(self, more: mi.Vector3f) -> Range:
-        """Return the range that holds `more`, too."""
-        return Range(dr.minimum(self.lower, more), dr.maximum(self.upper, more))
+    def around(self, vector: mi.Vector3f) -> Range:
+        """Return the range that holds `vector`, too."""
+        return Range(dr.minimum(self.lower, vector), dr.maximum(self.upper, vector))
 
 
 def clear_distance(posed: PosedField, rays: Rays, last: mi.UInt32) -> mi.Float:

@@ -72,8 +72,8 @@ class Column:
             return value.text
         if isinstance(value, tuple):
             some, total, ends = value
-            told = "" if ends is None else f" {[round(100 * end) for end in ends]}"
-            return "" if some is None else f"{some}/{total}{told}"
+            interval = "" if ends is None else f" {[round(100 * end) for end in ends]}"
+            return "" if some is None else f"{some}/{total}{interval}"
         if isinstance(value, list):
             return "[" + ", ".join(f"{end:.{self.digits}f}" for end in value) + "]"
         return "" if value is None else _text(value, self.digits)

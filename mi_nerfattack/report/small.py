@@ -71,8 +71,8 @@ def _trajectory(trajectory: Trajectory) -> bytes:
         paths = trajectory.states_numpy()[:, :, :2]
         _draw_paths(above, paths, f"{trajectory.count} {vehicles}")
         time_s = trajectory.dt * np.arange(trajectory.horizon)
-        given = trajectory.controls_numpy()
-        steering = given if given.ndim == 2 else given[..., 0]
+        commands = trajectory.controls_numpy()
+        steering = commands if commands.ndim == 2 else commands[..., 0]
         controls.plot(time_s, steering.T, linewidth=1)
         controls.set_xlabel("time (s)")
         controls.set_title("the policy's control")

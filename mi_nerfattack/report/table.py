@@ -34,7 +34,7 @@ _NO_OBJECT, _RANDOM, _ATTACK = (
 _ATTACK_CI95 = Column("95 % (m)", "attack.cross_track_mean_ci95_m", terminal=False)
 _DRIVES_OUT = ("attack.drives_departed", "attack.drives", "")
 _OUT = ("attack.attacks_out", "attacks", "attack.attacks_out_rate_ci95")
-_KEPT = ("transfer.kept", "transfer.of", "transfer.rate_ci95")
+_TRANSFER_SHARE = ("transfer.kept", "transfer.of", "transfer.rate_ci95")
 
 
 def metrics_table(document: Document) -> Table:
@@ -219,7 +219,7 @@ def transfer_table(document: Document) -> Table:
         Column("to surrogate", "ratio_to_surrogate", 2, short="to sur-\nrogate"),
         Column("drives out", _DRIVES_OUT, terminal=False),
         Column("attacks out", _OUT, short="attacks\nout"),
-        Column("transfer", _KEPT, terminal=False),
+        Column("transfer", _TRANSFER_SHARE, terminal=False),
     ]
     caption = (
         "Over attacks, each of which counts once: mean error and its 95 % interval, "
@@ -245,7 +245,7 @@ def quality_table(document: Document, condition: str) -> Table:
         Column("PSNR (dB)", "surrogate.psnr_heldout_db", 1),
         *(Column("steps", "surrogate.steps"), _ENVIRONMENT),
     ]
-    figures = [_ATTACK, Column("transfer", _KEPT)]
+    figures = [_ATTACK, Column("transfer", _TRANSFER_SHARE)]
     return Table(f"Surrogates ({condition})", labels, figures, rows)
 
 
@@ -292,7 +292,8 @@ def sweep_table(document: Document) -> Table:
         Column("drives\ndeparted", (*left, ""), page=False),
         Column("drives out", (*left, "departure_rate_ci95"), terminal=False, bad=True),
         Column(
-            *("attacks out", (*out, "attacks_out_rate_ci95")),
+            "attacks out",
+            (*out, "attacks_out_rate_ci95"),
             short="attacks\nout",
             bad=True,
         ),

@@ -75,8 +75,8 @@ class Replay(AbstractAdjoint):
     def visit(self, loop: ClosedLoop, drive: Trajectory) -> Iterator[Step]:
         """See :meth:`AbstractAdjoint.visit`."""
         for index in reversed(range(drive.horizon)):
-            seen = drive.observe(loop.sensor, index)
-            yield Step(index, drive.states[index], seen, drive.kept[index])
+            observation = drive.observe(loop.sensor, index)
+            yield Step(index, drive.states[index], observation, drive.tape[index])
 
 
 @dataclass(frozen=True)
@@ -103,9 +103,9 @@ class KeptBackgrounds(AbstractAdjoint):
         """See :meth:`AbstractAdjoint.visit`."""
         sensor = differentiable(loop)
         for index in reversed(range(drive.horizon)):
-            kept, memory = drive.kept[index]
-            seen = drive.restore(sensor, index, kept)
-            yield Step(index, drive.states[index], seen, memory)
+            record, memory = drive.tape[index]
+            observation = drive.restore(sensor, index, record)
+            yield Step(index, drive.states[index], observation, memory)
 
 
 @dataclass(frozen=True)
@@ -137,17 +137,17 @@ class Checkpointed(AbstractAdjoint):
         for start in reversed(starts):
             end = min(start + self.segment, drive.horizon)
             # Forward through a segment: keep its frames, and drive the policy's memory
-            memory, kept = drive.kept[start], []
+            memory, tape = drive.tape[start], []
             for index in range(start, end):
-                seen = drive.observe(sensor, index)
-                kept.append((sensor.keep(seen), memory))
+                observation = drive.observe(sensor, index)
+                tape.append((sensor.keep(observation), memory))
                 if index + 1 < end:
-                    image = loop.shown(seen, index)
+                    image = loop.shown(observation, index)
                     numbers = loop.numbers(drive.states[index], index)
                     _, memory = loop.policy.step(image, loop.goal, memory, numbers)
-                del seen
+                del observation
             # Back through the segment
             for index in reversed(range(start, end)):
-                view, memory = kept.pop()
-                seen = drive.restore(sensor, index, view)
-                yield Step(index, drive.states[index], seen, memory)
+                record, memory = tape.pop()
+                observation = drive.restore(sensor, index, record)
+                yield Step(index, drive.states[index], observation, memory)

@@ -132,14 +132,14 @@ class SceneCamera:
     def _draw(self, count: int, step: int) -> tuple[mi.Sampler, Any, mi.Point2f]:
         """Return a sampler, places in pixels (2, n) from 0 to 1, and on apertures."""
         rays = self.per_image
-        seed = dr.opaque(mi.UInt32, self.seed), dr.opaque(mi.UInt32, step)
-        sampler = keyed_sampler(*seed, self.first * rays, count * rays)
+        seed, period = dr.opaque(mi.UInt32, self.seed), dr.opaque(mi.UInt32, step)
+        sampler = keyed_sampler(seed, period, self.first * rays, count=count * rays)
         lens = self.sensor.needs_aperture_sample()
         if self.centred and not lens:
             return sampler, self._centres(count * rays), mi.Point2f(0)
         own = self.sensor.sampler().clone()
         own.set_samples_per_wavefront(self.spp)
-        own.seed(mi.sample_tea_32(*seed)[0], rays)
+        own.seed(mi.sample_tea_32(seed, period)[0], rays)
         within = self._centres(rays) if self.centred else own.next_2d()
         aperture = own.next_2d() if lens else mi.Point2f(dr.zeros(mi.Float, rays))
         dr.eval(within, aperture)
@@ -184,12 +184,12 @@ class SceneCamera:
         name = self.sensor.id()
         if self.sensor.needs_aperture_sample():
             raise InputError(f"sensor {name!r}: has an aperture; use perspective")
-        found, _ = from_mitsuba(self.sensor)
-        if self.size != (found.width, found.height):
+        lens, _ = from_mitsuba(self.sensor)
+        if self.size != (lens.width, lens.height):
             raise InputError(
                 f"sensor {name!r}: its film has a crop window; remove crop_* from it"
             )
-        return found
+        return lens
 
     def gain(self, item: PosedField, count: int) -> Gain:
         """Return the light on an object, ray by ray, as the variation draws it.
@@ -232,9 +232,9 @@ class SceneCamera:
         height, pitch = self._mount(dr.width(pose))
         mount = self.mount
         ahead, left, yaw = mount.forward_m, mount.left_m, mount.yaw_deg
-        found = mount_pose(state, height, ahead, pitch, left, yaw)
-        dr.eval(found)
-        return found
+        placement = mount_pose(state, height, ahead, pitch, left, yaw)
+        dr.eval(placement)
+        return placement
 
     def _drives(self, count: int) -> mi.UInt32:
         """Return the row of the batch that each ray belongs to, (n,)."""
@@ -269,8 +269,8 @@ class SceneCamera:
         spp = self.spp
         if spp == 1:
             return values
-        parts = values if dr.depth_v(values) > 1 else [values]
-        return type(values)(*[dr.block_sum(mi.Float(x), spp) / spp for x in parts])
+        channels = values if dr.depth_v(values) > 1 else [values]
+        return type(values)(*[dr.block_sum(mi.Float(x), spp) / spp for x in channels])
 
     def spread(self, d_linear: mi.Color3f) -> Any:
         """Transpose of :meth:`pixels`."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.notebook import picture
-from mi_nerfattack.ranges import Name, Positive, Whole, checked
+from mi_nerfattack.ranges import Name, Natural, Positive, checked
 from mi_nerfattack.vehicle.route.route import Route
 
 #: In the order of documents and plots; others follow, by name.
@@ -68,8 +68,8 @@ class Drive:
     environment: Name
     route: Name
     case: str
-    run: Whole
-    seed: Whole
+    run: Natural
+    seed: Natural
     states: np.ndarray
     controls: np.ndarray
     cross_track_m: np.ndarray

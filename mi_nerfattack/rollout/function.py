@@ -85,8 +85,8 @@ class Rollout:
     camera_path: CameraPath | None = None
 
     def __repr__(self) -> str:
-        parts = self.objective, self.reduction, self.adjoint
-        names = ", ".join(type(part).__name__ for part in parts)
+        components = self.objective, self.reduction, self.adjoint
+        names = ", ".join(type(component).__name__ for component in components)
         images = "attached" if self.attached else "detached"
         return f"Rollout({self.horizon} periods, {names}, {images}, {self.loop!r})"
 
@@ -158,7 +158,7 @@ class Rollout:
     def gradient(
         self,
         evaluation: Evaluation,
-        more: Sequence[str] = (),
+        extra_keys: Sequence[str] = (),
         recorder: StepRecorder | None = None,
         on_step: OnStep | None = None,
         scale: float = 1.0,
@@ -167,7 +167,7 @@ class Rollout:
 
         Args:
             evaluation: from :meth:`run`.
-            more: keys of parameters to differentiate by, besides the sensor's.
+            extra_keys: keys of parameters to differentiate by, besides the sensor's.
             recorder: takes the texture's gradient apart by control periods.
             on_step: called after each control period with its index.
             scale: factor of all derivatives.
@@ -176,7 +176,7 @@ class Rollout:
             TypeError: there are no such derivatives.
         """
         cost = Cost(self.objective, self.reduction, scale)
-        options = Options(self.attached, more, recorder, on_step)
+        options = Options(self.attached, extra_keys, recorder, on_step)
         drive = evaluation.trajectory
         return self.adjoint.gradient(self.loop, drive, cost, options)
 
@@ -186,7 +186,7 @@ class Rollout:
         """Differentiate by what the sensor gave; see ``backward_to_images``.
 
         Args:
-            drive: through the loop; `kept` is the policy's memory before each period,
+            drive: through the loop; `tape` is the policy's memory before each period,
                 as :class:`Replay` keeps it.
             steps: control periods.
         """
@@ -234,9 +234,9 @@ class _RolloutOp(dr.CustomOp):
     def backward(self) -> None:
         scale = float(dr.detach(self.grad_out())[0])
         with self._installed():  # others may have driven
-            found = self.rollout.gradient(self.evaluation, scale=scale)
-        self.set_grad_in("values", found.parameters)
-        self.set_grad_in("initial", found.initial)
+            gradient = self.rollout.gradient(self.evaluation, scale=scale)
+        self.set_grad_in("values", gradient.parameters)
+        self.set_grad_in("initial", gradient.initial)
 
     @contextmanager
     def _installed(self) -> Iterator[None]:

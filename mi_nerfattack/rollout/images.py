@@ -58,21 +58,21 @@ class SceneImages:
         # From the state to rays, to their radiance, and to linear pixels
         with dr.suspend_grad():
             sampler, *view = camera.rays(pose_of(state), count, step)
-            linear, kept = self._render(camera, sampler, view, None, gains)
-        return _observation(camera, linear, kept, view, count, step)
+            linear, state_out = self._render(camera, sampler, view, None, gains)
+        return _observation(camera, linear, state_out, view, count, step)
 
     def keep(self, observation: Observation) -> Any:
         """Keep what the integrator has to, or else the pixels and its whole state."""
         if self.collector is not None:
-            return self.collector.keep(observation.kept)
-        return observation.linear, observation.kept
+            return self.collector.keep(observation.integrator_state)
+        return observation.linear, observation.integrator_state
 
     def restore(
         self,
         camera: SceneCamera,
         state: Any,
         step: int,
-        kept: Any,
+        record: Any,
         gains: Sequence[Gain],
     ) -> Observation:
         """Return what :meth:`observe` gave, from what :meth:`keep` kept of it."""
@@ -81,10 +81,10 @@ class SceneImages:
         with dr.suspend_grad():
             sampler, *view = camera.rays(pose_of(state), count, step)
             if self.collector is None:
-                linear, inner = kept
+                linear, inner = record
             else:
                 dr.eval(view)
-                inner = self.collector.restore(view[0], kept, gains)
+                inner = self.collector.restore(view[0], record, gains)
                 linear, inner = self._render(camera, sampler, view, inner)
         return _observation(camera, linear, inner, view, count, step)
 
@@ -111,8 +111,9 @@ class SceneImages:
             δL = camera.spread(d_linear) * dr.detach(weight)
             # From the radiance to the parameters and, through its rays, to the state
             with dr.isolate_grad():
-                sampler, kept = camera.sampler(count, step), observation.kept
-                self._sample(camera, dr.ADMode.Backward, sampler, ray, δL, kept)
+                sampler = camera.sampler(count, step)
+                state_in = observation.integrator_state
+                self._sample(camera, dr.ADMode.Backward, sampler, ray, δL, state_in)
         if leaf is None:
             return None
         result = dr.grad(leaf)
@@ -139,12 +140,12 @@ class SceneImages:
         """Return linear pixels, and the integrator's state."""
         ray, weight = view
         mode = dr.ADMode.Primal
-        colour, _, _, kept = self._sample(
+        colour, _, _, state_out = self._sample(
             camera, mode, sampler, ray, None, state_in, gains
         )
         linear = camera.pixels(colour * weight)
-        dr.eval(linear, kept)
-        return linear, kept
+        dr.eval(linear, state_out)
+        return linear, state_out
 
     def _sample(
         self,
@@ -173,14 +174,19 @@ class SceneImages:
 
 
 def _observation(
-    camera: SceneCamera, linear: mi.Color3f, kept: Any, view: Any, count: int, step: int
+    camera: SceneCamera,
+    linear: mi.Color3f,
+    integrator_state: Any,
+    view: Any,
+    count: int,
+    step: int,
 ) -> Observation:
     width, height = camera.size
     with dr.suspend_grad():
         pixels = dr.ravel(_develop(linear))
         dr.eval(pixels)
     image = mi.TensorXf(pixels, (count, height, width, 3))
-    return Observation(image, step, linear, kept, view)
+    return Observation(image, step, linear, integrator_state, view)
 
 
 def _develop(linear: mi.Color3f) -> mi.Color3f:

@@ -83,8 +83,8 @@ class ClosedLoop:
         object.__setattr__(self, "transition", transition)
 
     def __repr__(self) -> str:
-        parts = self.sensor, self.policy, self.dynamics, self.integrator
-        names = ", ".join(type(part).__name__ for part in parts)
+        components = self.sensor, self.policy, self.dynamics, self.integrator
+        names = ", ".join(type(component).__name__ for component in components)
         return f"ClosedLoop({names}, goal {self.goal}, periods of {self.dt:g} s)"
 
     def numbered(self, first: int) -> ClosedLoop:
@@ -113,7 +113,7 @@ class ClosedLoop:
         if not self.policy.numbers:
             return None
         with dr.suspend_grad():
-            return stacked(self._told(dr.detach(state), step))
+            return stacked(self._number_rows(dr.detach(state), step))
 
     def numbers_vjp(self, state: Any, step: int, d_numbers: Any) -> Any:
         """Return the derivative by the state, (m, n), from that by the numbers."""
@@ -123,13 +123,13 @@ class ClosedLoop:
         weights = [kind(dr.gather(type(array), array, index + i)) for i in range(size)]
 
         def weighed(leaf: Any) -> Any:
-            pairs = zip(weights, self._told(leaf, step), strict=True)
+            pairs = zip(weights, self._number_rows(leaf, step), strict=True)
             # not every number depends on the state: a speed may be constant
             return sum((weight * row for weight, row in pairs), 0 * leaf[0])
 
         return vjp(weighed, state, 1)
 
-    def _told(self, state: Any, step: int) -> list[Any]:
+    def _number_rows(self, state: Any, step: int) -> list[Any]:
         """Return the numbers as rows (n,), differentiable in the state (m, n)."""
         speed = self.dynamics.speed_of(state) if self.policy.numbers.speed else None
         return numbers_of(self.policy.numbers, state, speed, step * self.dt, self.route)
@@ -237,7 +237,7 @@ class Trajectory:
         controls: of each period (n,), or (k, n) of k > 1: the policy's raw outputs,
             evaluated.
         dt: control period, seconds.
-        kept: what `keep` returned for each control period.
+        tape: what `keep` returned for each control period.
         camera_path: None where the camera was on the vehicle.
         still: the only frame, where the camera path shows a single one.
         rows: number of rows of a state that costs see; None for all.
@@ -246,7 +246,7 @@ class Trajectory:
     states: tuple[Any, ...]
     controls: tuple[Any, ...]
     dt: float
-    kept: tuple[Any, ...] = ()
+    tape: tuple[Any, ...] = ()
     camera_path: CameraPath | None = None
     still: Observation | None = None
     rows: int | None = None
@@ -282,13 +282,13 @@ class Trajectory:
         return sensor.observe(state, index)
 
     def restore(
-        self, sensor: AbstractDifferentiableSensor, period: int, kept: Any
+        self, sensor: AbstractDifferentiableSensor, period: int, record: Any
     ) -> Observation:
         """Return the frame of a period from what the sensor kept of it."""
         if self.still is not None:
             return self.still
         state, index = self.camera(period)
-        return sensor.restore(state, index, kept)
+        return sensor.restore(state, index, record)
 
     def states_numpy(self) -> np.ndarray:
         """States as (n, horizon + 1, m) float64."""
@@ -328,18 +328,18 @@ def simulate(
             vehicle takes, or an implicit step does not converge.
     """
     _check_drive(loop, initial, horizon)
-    states, controls, kept = [initial], [], []
+    states, controls, tape = [initial], [], []
     memory = loop.policy.initial_memory(dr.width(initial))
     camera = camera_path or CameraPath(states)  # which grow as the vehicles drive
     still: Observation | None = None
     for index in range(horizon):
         # The camera sees the scene, from the vehicle or from the path
         view, period = camera.at(index)
-        seen = still or loop.sensor.observe(view, period)
-        still = None if camera.frame is None else seen
-        step = Step(index, states[-1], seen, memory)
+        observation = still or loop.sensor.observe(view, period)
+        still = None if camera.frame is None else observation
+        step = Step(index, states[-1], observation, memory)
         # The policy steers by what it is shown
-        image, numbers = loop.shown(seen, index), loop.numbers(states[-1], index)
+        image, numbers = loop.shown(observation, index), loop.numbers(states[-1], index)
         control, memory = loop.policy.step(image, loop.goal, memory, numbers)
         require_controls(control_size(control), loop.dynamics.control_names)
         controls.append(controls_as(dr.value_t(type(initial)), control))
@@ -348,14 +348,14 @@ def simulate(
         states.append(loop.transition.advance(states[-1], *acting))
         dr.eval(controls[-1])
         if keep is not None:
-            kept.append(keep(step))
+            tape.append(keep(step))
         if on_step is not None:
             on_step(index)
     return Trajectory(
         states=tuple(states),
         controls=tuple(controls),
         dt=loop.dt,
-        kept=tuple(kept),
+        tape=tuple(tape),
         camera_path=camera_path,
         still=still,
         rows=loop.dynamics.own_rows,

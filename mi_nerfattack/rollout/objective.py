@@ -282,5 +282,5 @@ class Cost:
         by_rows = np.array(vjp(cost, history.rows, self.scale), np.float64)
         shape = (len(by_rows), history.count, history.horizon)
         unseen = len(drive.states[0]) - len(by_rows)
-        found = by_rows.reshape(shape).transpose(2, 1, 0)
-        return np.pad(found, ((0, 0), (0, 0), (0, unseen)))
+        by_states = by_rows.reshape(shape).transpose(2, 1, 0)
+        return np.pad(by_states, ((0, 0), (0, 0), (0, unseen)))

@@ -34,7 +34,7 @@ class CollectsRays(Protocol):
     def keep(self, state: Any) -> Any:
         """Return the costly part of a state that `sample` gave."""
 
-    def restore(self, ray: mi.Ray3f, kept: Any, gains: Sequence[Gain]) -> Any:
+    def restore(self, ray: mi.Ray3f, record: Any, gains: Sequence[Gain]) -> Any:
         """Return the state again, for the same rays in the same light."""
 
 
@@ -92,11 +92,11 @@ class Differentiated:
                 self.params[key] = dr.detach(value) if _is_array(value) else value
         self.params.update()
 
-    def start(self, more: Sequence[str] = ()) -> None:
+    def start(self, extra_keys: Sequence[str] = ()) -> None:
         """See :meth:`AbstractDifferentiableSensor.start_gradient`."""
         self.stop()
         try:
-            self._started = tuple(dict.fromkeys([*self.keys, *more]))
+            self._started = tuple(dict.fromkeys([*self.keys, *extra_keys]))
             self._start(list(self._started))
         except BaseException:
             self.stop()
@@ -114,25 +114,25 @@ class Differentiated:
                 self.params[key] = self._leaves[key] = leaf
         if self._leaves:  # an update evaluates the values of all parameters
             self.params.update()
-        found = {id(field): field for key in keys if (field := self.packed(key))}
-        for field in found.values():
+        fields = {id(field): field for key in keys if (field := self.packed(key))}
+        for field in fields.values():
             before = start_gradient(field)
             self._arrays.append((field, before, field.packed))
 
     def gradients(self) -> dict[str, Any]:
         """Return what has been accumulated, by key, each of its parameter's shape."""
         self.finish()
-        found = {}
+        gradients = {}
         for key in self._started:
             field = self.packed(key)
             name = key.rpartition(".")[2]
             leaf = self._leaves.get(key)
             if field is None:
-                found[key] = dr.grad(leaf)
-                dr.eval(found[key])
+                gradients[key] = dr.grad(leaf)
+                dr.eval(gradients[key])
             else:  # evaluated if it is looked at
-                found[key] = gradient(field, name)
-        return found
+                gradients[key] = gradient(field, name)
+        return gradients
 
     def finish(self) -> None:
         """March the rays that wait, so that gradients are complete."""

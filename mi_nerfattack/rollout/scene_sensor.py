@@ -98,18 +98,18 @@ class SceneSensor(AbstractDifferentiableSensor):
     def observe(self, state: Any, step: int) -> Observation:
         """Render a frame; see :meth:`AbstractSensor.observe`."""
         self._counter[0] += dr.width(state)
-        parts = [
+        observations = [
             self._images.observe(each, state, step, self._gains(each, state))
             for each in self.cameras
         ]
-        return self._join(parts)
+        return self._join(observations)
 
-    def _join(self, parts: list[Observation]) -> Observation:
-        if len(parts) == 1:
-            return parts[0]
-        image = side_by_side([part.image for part in parts], self._layout)
+    def _join(self, observations: list[Observation]) -> Observation:
+        if len(observations) == 1:
+            return observations[0]
+        image = side_by_side([each.image for each in observations], self._layout)
         dr.eval(image)
-        return Observation(image, parts[0].step, parts=tuple(parts))
+        return Observation(image, observations[0].step, per_camera=tuple(observations))
 
     @property
     def renders(self) -> int:
@@ -163,15 +163,17 @@ class SceneSensor(AbstractDifferentiableSensor):
 
     def keep(self, observation: Observation) -> Any:
         """Keep what the integrator has to of each camera's image."""
-        return [self._images.keep(each) for each in observation.parts or [observation]]
-
-    def restore(self, state: Any, step: int, kept: Any) -> Observation:
-        """See :meth:`AbstractDifferentiableSensor.restore`."""
-        parts = [
-            self._images.restore(camera, state, step, one, self._gains(camera, state))
-            for camera, one in zip(self.cameras, kept, strict=True)
+        return [
+            self._images.keep(each) for each in observation.per_camera or [observation]
         ]
-        return self._join(parts)
+
+    def restore(self, state: Any, step: int, record: Any) -> Observation:
+        """See :meth:`AbstractDifferentiableSensor.restore`."""
+        observations = [
+            self._images.restore(camera, state, step, one, self._gains(camera, state))
+            for camera, one in zip(self.cameras, record, strict=True)
+        ]
+        return self._join(observations)
 
     def vjp(
         self, observation: Observation, state: Any, d_image: Any, attached: bool
@@ -182,9 +184,9 @@ class SceneSensor(AbstractDifferentiableSensor):
             InputError: `attached`, and the integrator has no derivative by its rays.
         """
         # Each camera adds to the gradients of the parameters, and to the state's
-        parts, by_pose = observation.parts or [observation], None
+        observations, by_pose = observation.per_camera or [observation], None
         d_parts = self._layout.split(d_image)
-        for item in zip(self.cameras, parts, d_parts, strict=True):
+        for item in zip(self.cameras, observations, d_parts, strict=True):
             camera, part, d_part = item
             by_one = self._images.vjp(camera, part, state, d_part, attached)
             by_pose = by_one if by_pose is None else by_pose + by_one
@@ -196,8 +198,8 @@ class SceneSensor(AbstractDifferentiableSensor):
         if not self._lit:
             return []
         count, lit = dr.width(state), self._lit
-        found = {k: camera.gain(item, count) for k, item in lit.items()}
-        return [found.get(id(layer), Gain()) for layer in self.layers]
+        gains = {k: camera.gain(item, count) for k, item in lit.items()}
+        return [gains.get(id(layer), Gain()) for layer in self.layers]
 
     # Cameras
 
@@ -296,9 +298,9 @@ class SceneSensor(AbstractDifferentiableSensor):
         """See :meth:`AbstractDifferentiableSensor.set_parameters`."""
         self._parameters.assign(values)
 
-    def start_gradient(self, more: Sequence[str] = ()) -> None:
+    def start_gradient(self, extra_keys: Sequence[str] = ()) -> None:
         """See :meth:`AbstractDifferentiableSensor.start_gradient`."""
-        self._parameters.start(more)
+        self._parameters.start(extra_keys)
 
     def gradients(self) -> dict[str, Any]:
         """See :meth:`AbstractDifferentiableSensor.gradients`."""

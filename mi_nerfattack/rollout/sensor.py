@@ -23,17 +23,17 @@ class Observation:
         step: index of the control period.
         linear: (3, n height width), before the sRGB curve; None where the sensor has
             no derivatives, and where the frame has parts.
-        kept: what the scene's integrator hands to its derivatives.
+        integrator_state: what the scene's integrator hands to its derivatives.
         view: rays and their weights.
-        parts: what each of several cameras saw, side by side in the image.
+        per_camera: what each of several cameras saw, side by side in the image.
     """
 
     image: Any
     step: int = 0
     linear: Any = None
-    kept: Any = None
+    integrator_state: Any = None
     view: Any = None
-    parts: tuple[Observation, ...] = ()
+    per_camera: tuple[Observation, ...] = ()
 
     def __repr__(self) -> str:
         count, height, width, _ = self.image.shape
@@ -122,11 +122,11 @@ class AbstractDifferentiableSensor(AbstractSensor):
         """
 
     @abstractmethod
-    def start_gradient(self, more: Sequence[str] = ()) -> None:
+    def start_gradient(self, extra_keys: Sequence[str] = ()) -> None:
         """Let the gradients of the selected parameters be zero.
 
         Args:
-            more: keys of parameters to differentiate by, too.
+            extra_keys: keys of parameters to differentiate by, too.
 
         Raises:
             InputError: a parameter has no derivative; the message names what works.
@@ -174,13 +174,13 @@ class AbstractDifferentiableSensor(AbstractSensor):
         """Return what a backward pass must have kept to call :meth:`restore`."""
         return observation
 
-    def restore(self, state: Any, step: int, kept: Any) -> Observation:
+    def restore(self, state: Any, step: int, record: Any) -> Observation:
         """Return an observation from what :meth:`keep` gave.
 
         Args:
             state: (m, n), as given to ``observe``.
             step: as given to ``observe``.
-            kept: of that observation.
+            record: of that observation.
         """
         del state, step
-        return kept
+        return record

@@ -81,12 +81,12 @@ class StepRecorder:
         """Record one period from the sums so far; periods come last one first."""
         sums = [t.numpy().ravel().copy() for t in textures]
         before = self._before or [np.zeros_like(value) for value in sums]
-        parts = [value - old for value, old in zip(sums, before, strict=True)]
+        gradients = [value - old for value, old in zip(sums, before, strict=True)]
         self._before = sums
         if self.on_period is not None:
-            self.on_period(index, parts)
-        norms = [float(np.linalg.norm(part)) for part in parts]
-        pairs = zip(parts, self.directions, strict=False)
+            self.on_period(index, gradients)
+        norms = [float(np.linalg.norm(gradient)) for gradient in gradients]
+        pairs = zip(gradients, self.directions, strict=False)
         self._rows.append((norms, [float(a @ b) for a, b in pairs]))
 
     def result(self) -> Attribution:
@@ -102,13 +102,13 @@ class Options:
     Attributes:
         attached: keep the derivative of the image by the state (A.12 stops it). Only
             attached gradients are those of the whole loop.
-        more: keys of parameters to differentiate by, besides those of the sensor.
+        extra_keys: keys of parameters to differentiate by, besides those of the sensor.
         recorder: takes the gradient apart by control periods.
         on_step: called after each control period with its index.
     """
 
     attached: bool = False
-    more: Sequence[str] = ()
+    extra_keys: Sequence[str] = ()
     recorder: StepRecorder | None = None
     on_step: OnStep | None = None
 
@@ -275,7 +275,7 @@ def backward(
     sweep = Sweep(loop, drive, options.attached, together)
     d_before, costates = to_state(np.zeros_like(d_states[0])), []
     try:
-        sensor.start_gradient(options.more)
+        sensor.start_gradient(options.extra_keys)
         for step in visits:
             # A.9, resolved: minus l_t is dJ/dx_t and the derivative through x_{t+1}
             d_after = d_before + to_state(d_states[step.index])
@@ -311,7 +311,7 @@ def backward_to_images(
 
     Args:
         loop: as it was when it drove.
-        drive: what it did; `kept` is the policy's memory before each period.
+        drive: what it did; `tape` is the policy's memory before each period.
         d_states: (T, n, m), derivatives of J by x_1 to x_T.
         steps: control periods.
         attached: keep the derivative of the image by the state.
@@ -324,11 +324,11 @@ def backward_to_images(
         TypeError: sensor or policy have no such derivatives.
         InputError: attached, along a camera path.
     """
-    sensor, found = differentiable(loop), {}
+    sensor, d_images = differentiable(loop), {}
 
     def keep(index: int, d_image: Any) -> None:
         if index in steps:
-            found[index] = d_image.numpy().copy()
+            d_images[index] = d_image.numpy().copy()
 
     sweep = Sweep(loop, drive, attached, on_image=keep)
     policy = loop.policy
@@ -340,28 +340,29 @@ def backward_to_images(
             state = drive.states[index]
             d_after = d_before + to_state(d_states[index])
             if linked or index in steps:
-                seen = drive.observe(sensor, index)
-                step = Step(index, state, seen, drive.kept[index])
+                observation = drive.observe(sensor, index)
+                step = Step(index, state, observation, drive.tape[index])
                 d_before = sweep.back(step, d_after)
             else:
                 d_before = sweep.back_blindly(index, state, d_after)
                 dr.eval(d_before, sweep.pending)
     finally:
         sensor.stop_gradient()
-    return found
+    return d_images
 
 
-def _batch(parts: tuple[Any, ...]) -> Any:
+def _batch(arrays: tuple[Any, ...]) -> Any:
     """Lay rows, arrays of rows, or tensors along their first axis, end to end."""
-    first = parts[0]
-    if len(parts) == 1:
+    first = arrays[0]
+    if len(arrays) == 1:
         return first
     if not dr.is_tensor_v(first) and dr.depth_v(first) == 2:
-        return type(first)(*[_batch(rows) for rows in zip(*parts, strict=True)])
+        return type(first)(*[_batch(rows) for rows in zip(*arrays, strict=True)])
     if not dr.is_tensor_v(first):
-        return concat(parts, [dr.width(first)] * len(parts))
-    size, shape = dr.width(first.array), (len(parts) * first.shape[0], *first.shape[1:])
-    rows = concat([part.array for part in parts], [size] * len(parts))
+        return concat(arrays, [dr.width(first)] * len(arrays))
+    size = dr.width(first.array)
+    shape = (len(arrays) * first.shape[0], *first.shape[1:])
+    rows = concat([part.array for part in arrays], [size] * len(arrays))
     return type(first)(rows, shape)
 
 
@@ -370,8 +371,8 @@ def _unbatch(tensor: Any, count: int) -> list[Any]:
     if count == 1:
         return [tensor]
     shape = (tensor.shape[0] // count, *tensor.shape[1:])
-    parts = split(tensor.array, dr.width(tensor.array) // count)
-    return [type(tensor)(part, shape) for part in parts]
+    arrays = split(tensor.array, dr.width(tensor.array) // count)
+    return [type(tensor)(part, shape) for part in arrays]
 
 
 def differentiable(loop: ClosedLoop) -> AbstractDifferentiableSensor:

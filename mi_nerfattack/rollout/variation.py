@@ -9,7 +9,7 @@ import drjit as dr
 import numpy as np
 
 from mi_nerfattack.backend.arrays import rows_type
-from mi_nerfattack.ranges import NonNegative, Whole, checked
+from mi_nerfattack.ranges import Natural, NonNegative, checked
 from mi_nerfattack.render.lighting.lights import Sunlight
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics, Dubins
 
@@ -72,7 +72,7 @@ class Variation:
     steering_lag_s_sd: NonNegative = 0.0
     delay_s_sd: NonNegative = 0.0
     sun: SunRanges | None = None
-    seed: Whole = 0
+    seed: Natural = 0
 
     @property
     def of_light(self) -> bool:
@@ -197,15 +197,15 @@ class Varied(AbstractDynamics):
         lagging = []
         if rate:  # what acts is a row of the state, which follows the command
             acting, several = state[len(state) - 1], self.control_size > 1
-            command, *more = list(control) if several else [control]
+            command, *controls = list(control) if several else [control]
             lagging = [rate[0] * (command - acting)]
-            control = rows_type(type(acting))(acting, *more) if several else acting
+            control = rows_type(type(acting))(acting, *controls) if several else acting
         slope = self.model.derivative(self._without_lag(state), control)
         if not isinstance(self.model, Dubins):
             steering = steering * speed
-        moved = speed * slope[0], speed * slope[1], steering * slope[2]
-        others = [slope[i] for i in range(3, len(slope))]
-        return type(state)(*moved, *others, *lagging)
+        pose_rates = [speed * slope[0], speed * slope[1], steering * slope[2]]
+        other_rates = [slope[i] for i in range(3, len(slope))]
+        return type(state)(*pose_rates, *other_rates, *lagging)
 
     def delays(self, count: int) -> np.ndarray | None:
         """See :meth:`AbstractDynamics.delays`."""
@@ -236,7 +236,7 @@ class Varied(AbstractDynamics):
             numbers = [drawn.speed, drawn.steering]
             if self._has_lag:
                 numbers += [1 / np.maximum(drawn.lag_s, self.step_s)]
-            found = [kind(values.tolist()) for values in numbers]
-            dr.make_opaque(found)
-            self._uploaded[key] = found
+            constants = [kind(values.tolist()) for values in numbers]
+            dr.make_opaque(constants)
+            self._uploaded[key] = constants
         return self._uploaded[key]

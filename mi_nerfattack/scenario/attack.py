@@ -29,17 +29,13 @@ from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.ranges import (
     Count,
     Finite,
+    Natural,
     NonNegative,
     Positive,
     Share,
     SomeShare,
-    Whole,
 )
-from mi_nerfattack.rollout.adjoint import (
-    Checkpointed,
-    KeptBackgrounds,
-    Replay,
-)
+from mi_nerfattack.rollout.adjoint import Checkpointed, KeptBackgrounds, Replay
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.scenario.named_file import File
 from mi_nerfattack.scenario.objective import VarySection
@@ -117,13 +113,12 @@ class AbstractGradientMethod(AbstractMethod):
     def build(self, task: Task) -> AbstractAttack:
         """See :meth:`AbstractMethod.build`."""
         left = self.max_iterations - self._each * self._tries
-        schedule = Schedule(left, self.final_rate)
         return GradientAttack(
             self._rollout(task),
             task.route,
             task.initial,
             task.freedom,
-            Plan(schedule, self._opening(task), self.follow),
+            Plan(Schedule(left, self.final_rate), self._opening(task), self.follow),
             one_level=self.one_level,
         )
 
@@ -161,7 +156,7 @@ class FrameMethod(AbstractGradientMethod):
     """Of one frame of an unattacked drive: rendered once, it is shown all the time."""
 
     kind: Literal["single_frame"]
-    frame: Whole = 0  # of the drive
+    frame: Natural = 0  # of the drive
 
     def rendered(self, horizon: int) -> int:
         """See :meth:`AbstractMethod.rendered`."""
@@ -186,9 +181,14 @@ class AbstractSearchMethod(AbstractMethod):
                 "attack.freedom.kind: searches change textures alone; set it to "
                 "'texture', or attack.method.kind to 'gradient'"
             )
-        search = self.search(task)
-        parts = task.rollout, task.route, task.initial, task.freedom
-        return SurrogateSearch(search, *parts, self.frames)
+        return SurrogateSearch(
+            self.search(task),
+            task.rollout,
+            task.route,
+            initial=task.initial,
+            freedom=task.freedom,
+            frames=self.frames,
+        )
 
     @abstractmethod
     def search(self, task: Task) -> AbstractSearch:
@@ -220,8 +220,9 @@ class BlockMethod(AbstractSearchMethod):
     def search(self, task: Task) -> AbstractSearch:
         proposals = self.iterations(task.frames)
         fields = task.fields
-        rest = proposals, self.first_block, task.seed
-        return BlockSearch(task.colourings, fields, *rest)
+        return BlockSearch(
+            task.colourings, fields, proposals, share=self.first_block, seed=task.seed
+        )
 
 
 class EvolutionMethod(AbstractSearchMethod):
@@ -237,8 +238,9 @@ class EvolutionMethod(AbstractSearchMethod):
         from mi_nerfattack.attack.black_box.evolution import EvolutionSearch
 
         basis = LowFrequency(task.colourings, self.coefficients)
-        rest = self.variant, self.spread, self.population, task.seed
-        return EvolutionSearch(basis, *rest)
+        return EvolutionSearch(
+            basis, self.variant, self.spread, population=self.population, seed=task.seed
+        )
 
 
 class BayesianMethod(AbstractSearchMethod):
@@ -263,7 +265,6 @@ MethodSection = Annotated[
     | BayesianMethod,
     Kinds("gradient", AbstractMethod),
 ]
-
 
 Corner = tuple[Finite, Finite, Finite]
 Box = tuple[Corner, Corner]

@@ -30,7 +30,7 @@ _BUILT: WeakKeyDictionary[GridField, dict[str, BuiltInObject]] = WeakKeyDictiona
 _LOOKS = 4  # of a field that are kept
 #: Geometry of what was built in last, by all that decides it.
 _SHELLS: dict[str, Shell] = {}
-_KEPT_SHELLS = 4
+_MAX_SHELLS = 4
 
 Label = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,19}$")]
 Sky = Literal["day", "morning", "noon", "evening", "overcast"]
@@ -151,14 +151,14 @@ _Several = Annotated[tuple[DeploymentSection, ...], Field(min_length=1)]
 #: A table, or an array of tables.
 DeploymentSections = Annotated[
     Annotated[DeploymentSection, Tag("table")] | Annotated[_Several, Tag("array")],
-    Discriminator(lambda given: "array" if isinstance(given, tuple) else "table"),
+    Discriminator(lambda sections: "array" if isinstance(sections, tuple) else "table"),
     UNTAGGED,
 ]
 
 
-def labelled(given: DeploymentSections) -> list[tuple[str, DeploymentSection]]:
+def labelled(deployment: DeploymentSections) -> list[tuple[str, DeploymentSection]]:
     """Return each section with its label: its name, or its kind if it has none."""
-    sections = given if isinstance(given, tuple) else [given]
+    sections = deployment if isinstance(deployment, tuple) else [deployment]
     return [(item.name or item.kind, item) for item in sections]
 
 
@@ -201,10 +201,11 @@ class Deployment:
     def open(self, objects: Sequence[PosedField]) -> AbstractEnvironment:
         """Make the environment, objects as they look and stand at present."""
         if self.builds_in:
-            grids = [
-                (p.field, p.placed) for p in objects if isinstance(p.field, GridField)
-            ]
-            built_in = tuple(_built_in(*item) for item in grids)
+            built_in = tuple(
+                _built_in(item.field, item.placed)
+                for item in objects
+                if isinstance(item.field, GridField)
+            )
             return self._make(replace(self.conditions, built_in=built_in))
         environment = self._make(self.conditions)
         environment.show(objects)
@@ -221,9 +222,9 @@ def _built_in(field: GridField, pose: Pose) -> BuiltInObject:
     values = [value.numpy() for value in field.parameters().values()]
     key = array_digest([*values, *field.occupancy_tensors().values()])
     looks = _BUILT.setdefault(field, {})
-    found = looks.pop(key, None) or paint(_shell(field), field, pose)
-    _remember(looks, key, found, _LOOKS)
-    return replace(found, pose=pose)
+    built = looks.pop(key, None) or paint(_shell(field), field, pose)
+    _remember(looks, key, built, _LOOKS)
+    return replace(built, pose=pose)
 
 
 def _shell(field: GridField) -> Shell:
@@ -231,32 +232,32 @@ def _shell(field: GridField) -> Shell:
     density = field.parameters()["density"].numpy()
     arrays = array_digest([density, *field.occupancy_tensors().values()])
     key = json_digest([arrays, field.metadata()])
-    found = _SHELLS.pop(key, None) or shell_of(field)
-    _remember(_SHELLS, key, found, _KEPT_SHELLS)
-    return found
+    shell = _SHELLS.pop(key, None) or shell_of(field)
+    _remember(_SHELLS, key, shell, _MAX_SHELLS)
+    return shell
 
 
-def _remember(kept: dict[str, Any], key: str, value: Any, most: int) -> None:
+def _remember(cache: dict[str, Any], key: str, value: Any, most: int) -> None:
     """Add the newest value, and forget the oldest."""
-    kept[key] = value
-    while len(kept) > most:
-        del kept[next(iter(kept))]
+    cache[key] = value
+    while len(cache) > most:
+        del cache[next(iter(cache))]
 
 
-def deployments(given: DeploymentSections, place: Place) -> Mapping[str, Deployment]:
+def deployments(sections: DeploymentSections, place: Place) -> Mapping[str, Deployment]:
     """Return the deployments of a scenario by label, in its order.
 
     Args:
-        given: their sections.
+        sections: of the deployments.
         place: where the scenario drives.
     """
-    found = {}
-    for label, section in labelled(given):
+    by_label = {}
+    for label, section in labelled(sections):
         values = section.model_dump()
         names = ("sky", "exposure_ev", "spp", "blur_px", "noise_sd")
         conditions = Conditions(**{n: values[n] for n in names if n in values})
         builds_in, there = values.get("objects") == "built-in", section.place(place)
-        found[label] = Deployment(
+        by_label[label] = Deployment(
             section.kind, there, conditions, builds_in, section.settings
         )
-    return found
+    return by_label

@@ -89,7 +89,7 @@ class NamedFile:
             return {"file": self.name, "sha256": digest.hexdigest()}
         if os.path.isdir(self.path):  # never raises; Path.is_dir may
             return {"file": self.path.name, "sha256": _folder_digest(self.path)}
-        raw, found = _read(self.path), dict[str, str]()
+        raw, package_entry = _read(self.path), dict[str, str]()
         digest = hashlib.sha256(raw)
         digest.update(self.function.encode())
         if self.path.suffix.lower() == ".xml":
@@ -98,12 +98,12 @@ class NamedFile:
                 digest.update(hashlib.sha256(_read(inner)).digest())
             if packages:
                 digest.update(packages.encode())
-                found["packages"] = packages
+                package_entry["packages"] = packages
         if self.function:
             for name, helper in sorted(helper_files(self.path).items()):
                 digest.update(f"{name} {files.sha256(helper)}\n".encode())
         shown = ":".join(filter(None, (self.path.name, self.function)))
-        return {"file": shown, "sha256": digest.hexdigest(), **found}
+        return {"file": shown, "sha256": digest.hexdigest(), **package_entry}
 
 
 def _path(value: Any, info: ValidationInfo) -> NamedFile:

@@ -211,11 +211,11 @@ class ObjectiveSection(Section):
     @property
     def name(self) -> str:
         """The terms and their weights, as verdict and pages call the objective."""
-        parts = [
+        terms = [
             term.name if term.weight == 1 else f"{term.weight:g} x {term.name}"
             for term in self.term
         ]
-        return " + ".join(parts)
+        return " + ".join(terms)
 
     @property
     def is_lane_distance(self) -> bool:

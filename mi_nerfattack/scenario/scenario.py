@@ -22,7 +22,7 @@ from mi_nerfattack.io import files
 from mi_nerfattack.io.overrides import set_keys, tell
 from mi_nerfattack.io.strict import parse_toml
 from mi_nerfattack.policy.base import AbstractPolicy
-from mi_nerfattack.ranges import Count, Finite, Fraction, NonNegative, Positive, Whole
+from mi_nerfattack.ranges import Count, Finite, Fraction, Natural, NonNegative, Positive
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.render.march import STOP
@@ -133,8 +133,8 @@ class DriveSection(Section):
         """
         if self.horizon is not None:
             return self.horizon
-        rest = route.length if route.closed else route.length - self.start_m
-        length = rest if self.length_m is None else self.length_m
+        distance = route.length if route.closed else route.length - self.start_m
+        length = distance if self.length_m is None else self.length_m
         if (periods := length / (route.speed_ms * period)) >= _LONGEST:
             raise InputError(
                 f"drive.length_m: {length:g} m are {periods:.3g} control periods; "
@@ -190,7 +190,7 @@ class Scenario(Section):
     """A complete scenario."""
 
     name: Annotated[str, Field(min_length=1)]
-    seed: Annotated[Whole, Field(lt=2**31)] = 0
+    seed: Annotated[Natural, Field(lt=2**31)] = 0
     scene: SceneSection
     objects: Annotated[tuple[ObjectSection, ...], Field(min_length=1)]
     policy: PolicySection
@@ -306,12 +306,12 @@ class Scenario(Section):
         Raises:
             InputError: a file cannot be read.
         """
-        found = {}
+        identity = {}
         for location, value in self.leaves():
             key = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in location)
             value = content(value) if isinstance(value, NamedFile) else value
-            found[f"scenario{key}"] = json.dumps(value, sort_keys=True)
-        return found
+            identity[f"scenario{key}"] = json.dumps(value, sort_keys=True)
+        return identity
 
     def digest(self) -> str:
         """Hash all values, and the content of the files that they name.
@@ -339,8 +339,8 @@ class Scenario(Section):
             value.pop("file")
         text = json.dumps(values, sort_keys=True)
         own = hashlib.sha256(text.encode()).hexdigest()[:16]
-        found = {key[len("scenario.") :]: v["sha256"] for key, v in named.items()}
-        return {"scenario": own, **found}
+        checksums = {key[len("scenario.") :]: v["sha256"] for key, v in named.items()}
+        return {"scenario": own, **checksums}
 
 
 def is_within(key: str, names: Sequence[str]) -> bool:
@@ -350,8 +350,8 @@ def is_within(key: str, names: Sequence[str]) -> bool:
         key: such as ``scenario.scene.field``.
         names: of the parts, such as ``scene`` or ``scene.field``.
     """
-    parts = [f"scenario.{name}" for name in names]
-    return any(key == p or key.startswith((f"{p}.", f"{p}[")) for p in parts)
+    prefixes = [f"scenario.{name}" for name in names]
+    return any(key == p or key.startswith((f"{p}.", f"{p}[")) for p in prefixes)
 
 
 def load_scenario(
@@ -384,8 +384,8 @@ def load_scenario(
         folder = {"folder": Path(path).parent}
         scenario = Scenario.model_validate(data, context=folder)
     except ValidationError as err:
-        told = new_lines(path, own) or tell(path, text, problems(err), settings)
-        raise InputError(told) from err
+        message = new_lines(path, own) or tell(path, text, problems(err), settings)
+        raise InputError(message) from err
     if object_field is None:
         return scenario, text
     field = NamedFile(str(object_field.resolve()), object_field.resolve())

@@ -158,11 +158,11 @@ class Kinds:
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> JsonSchemaValue:
         """Require the key of all kinds but the default."""
-        found = handler(schema)
+        json_schema = handler(schema)
         if callable(self.default):
-            return {"anyOf": found["oneOf"]}
-        default = found["discriminator"]["mapping"].get(self.default)
-        others = [item for item in found["oneOf"] if item["$ref"] != default]
+            return {"anyOf": json_schema["oneOf"]}
+        default = json_schema["discriminator"]["mapping"].get(self.default)
+        others = [item for item in json_schema["oneOf"] if item["$ref"] != default]
         kinds = [item | {"required": ["kind"]} for item in others]
         return {"oneOf": [*([{"$ref": default}] if default else []), *kinds]}
 
@@ -184,10 +184,10 @@ class Kinds:
             what, location, message = error["type"], error["loc"], error["msg"]
             if what == "union_tag_invalid":
                 allowed = error.get("ctx", {})["expected_tags"].replace("'", '"')
-                given = f"is {data['kind']!r}" if data["kind"] else "is missing"
-                return "told", ("kind",), f"{given}; one of {allowed}"
+                problem = f"is {data['kind']!r}" if data["kind"] else "is missing"
+                return "told", ("kind",), f"{problem}; one of {allowed}"
             if len(location) == 2 and what in ("missing", *_UNKNOWN):
-                message, what = _told(members, what, *map(str, location)), "told"
+                message, what = _key_problem(members, what, *map(str, location)), "told"
             return what, location[1:], message
 
         return _reworded(lambda: read(data), reword)
@@ -207,9 +207,9 @@ def read_offered(
 
 def _written(value: Any, write: _Reader, info: Any) -> dict[str, Any]:
     """Write a section with its kind, whatever its defaults."""
-    kind, how = {"kind": value.kind}, {"exclude_defaults": info.exclude_defaults}
+    kind, options = {"kind": value.kind}, {"exclude_defaults": info.exclude_defaults}
     if isinstance(value, Section) and value.package:  # no member of the union
-        values = value.model_dump(mode=info.mode, **how)
+        values = value.model_dump(mode=info.mode, **options)
         return kind | values | {"package": value.package}
     return kind | write(value)
 
@@ -238,23 +238,23 @@ def _reworded(
     try:
         return read()
     except ValidationError as err:
-        found = [(*reword(error), error["input"]) for error in err.errors()]
-        errors = [_error(way, text, kind, value) for kind, way, text, value in found]
+        reworded = [(*reword(error), error["input"]) for error in err.errors()]
+        errors = [_error(way, text, kind, value) for kind, way, text, value in reworded]
         raise ValidationError.from_exception_data("", errors) from None
 
 
-def _told(members: tuple[Any, ...], what: str, kind: str, key: str) -> str:
+def _key_problem(members: tuple[Any, ...], what: str, kind: str, key: str) -> str:
     """Say what is wrong with a key that a kind needs, or does not have."""
-    here = f'kind = "{kind}"'
+    line = f'kind = "{kind}"'
     if what == "missing":
-        return f"is missing; {here} needs it"
+        return f"is missing; {line} needs it"
     keys = {member: list(signature(member).parameters) for member in members}
     allowed = ", ".join(next(keys[m] for m in members if kind in _kinds_of(m)))
     having = [f'"{k}"' for m in members if key in keys[m] for k in _kinds_of(m)]
     if not having:
-        return f"unknown key; allowed with {here}: {allowed}"
+        return f"unknown key; allowed with {line}: {allowed}"
     others = " or ".join(having)
-    return f"has no meaning with {here}, which allows {allowed}; set kind to {others}"
+    return f"has no meaning with {line}, which allows {allowed}; set kind to {others}"
 
 
 def _kinds_of(member: Any) -> tuple[str, ...]:
@@ -289,16 +289,16 @@ def read_section(name: str, kind: Any, values: Any, folder: str | Path) -> Any:
 
 def problems(err: ValidationError) -> Iterator[tuple[Location, str]]:
     """Yield the keys that lead to each problem, and what is wrong."""
-    found = err.errors()
-    lists = {error["loc"][:1] for error in found if len(error["loc"]) > 1}
-    for error in found:
+    details = err.errors()
+    lists = {error["loc"][:1] for error in details if len(error["loc"]) > 1}
+    for error in details:
         kind, location = error["type"], error["loc"]
         if kind == "too_short" and location in lists:
             continue  # its only item is wrong, and told
         message = _WORDS.get(kind, error["msg"])
         is_worded = kind in ("told", "unknown", "missing")
-        given = "" if is_worded else f" (is {error['input']!r})"
-        yield location, message[0].lower() + message[1:] + given
+        suffix = "" if is_worded else f" (is {error['input']!r})"
+        yield location, message[0].lower() + message[1:] + suffix
 
 
 def _leaves(location: Location, value: Any) -> Iterator[tuple[Location, Any]]:

@@ -60,13 +60,13 @@ def upgraded(values: Mapping[str, Any]) -> dict[str, Any]:
         if name != "objective":
             return _moved(table, _MOVES[name])
         first = {key: value for key, value in table.items() if key in _FIRST}
-        found = {key: value for key, value in table.items() if key not in _FIRST}
-        terms = found.pop("terms", [])
+        objective = {key: value for key, value in table.items() if key not in _FIRST}
+        terms = objective.pop("terms", [])
         if not isinstance(terms, list) or not all(isinstance(t, dict) for t in terms):
             return table
         if first or terms:
-            found["term"] = [_moved(term, _TERM) for term in (first, *terms)]
-        return _moved(found, _MOVES[name])
+            objective["term"] = [_moved(term, _TERM) for term in (first, *terms)]
+        return _moved(objective, _MOVES[name])
 
     return {
         name: _each(partial(change, name), value, name in (*_AXES, *_MOVES))
@@ -83,8 +83,8 @@ def upgraded_environment(name: str, scenario: Mapping[str, Any]) -> str:
         name: in the results.
         scenario: the values of their scenario.
     """
-    given = upgraded(scenario).get("deployment", {})
-    [section, *others] = given if isinstance(given, list) else [given]
+    deployment = upgraded(scenario).get("deployment", {})
+    [section, *others] = deployment if isinstance(deployment, list) else [deployment]
     if name != "deployment" or others:
         return name
     return section.get("name") or section.get("kind", "mitsuba")
@@ -98,17 +98,17 @@ def _each(change: Callable[[Any], Any], value: Any, is_one: bool) -> Any:
 
 
 def _moved(table: Mapping[str, Any], moves: Mapping[str, str]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    moved: dict[str, Any] = {}
     for key, value in table.items():
         if isinstance(value, dict):
-            found[key] = found.get(key, {}) | value
+            moved[key] = moved.get(key, {}) | value
         elif (key, value) != ("at", "all_times"):  # the weights say so
-            inner = found
+            inner = moved
             *way, last = moves.get(key, key).split(".")
             for part in way:
                 inner = inner.setdefault(part, {})
             inner[last] = value
-    return found
+    return moved
 
 
 def upgraded_text(path: str | Path, text: str) -> str:
@@ -119,18 +119,18 @@ def upgraded_text(path: str | Path, text: str) -> str:
             say.
     """
     values = parse_toml(path, text)
-    wanted = upgraded(values)
-    if wanted == values:
+    upgraded_values = upgraded(values)
+    if upgraded_values == values:
         return text
     result = "".join(_rewritten(text))
     try:
-        if parse_toml(path, result) == wanted:
+        if parse_toml(path, result) == upgraded_values:
             return result
     except InputError:
         pass  # such as a table that is there twice
     raise InputError(
         f"{path}: is of an older form, which only you can rewrite; it must say:\n"
-        f"{tomlkit.dumps(wanted)}"
+        f"{tomlkit.dumps(upgraded_values)}"
     )
 
 
@@ -172,12 +172,12 @@ class _Table:
     def text(self) -> str:
         """Return the table, and those that its statements stand in now."""
         is_gone = self.moved and not self.own and "#" not in self.header
-        parts = [] if is_gone else [self.header + self.own]
+        blocks = [] if is_gone else [self.header + self.own]
         for name, statements in self.moved.items():
             header = ".".join([*self.way, name])
             header = f"[[{header}]]" if name == "term" else f"[{header}]"
-            parts.append(f"{header}\n{statements}")
-        return self.comments + "\n".join(parts)
+            blocks.append(f"{header}\n{statements}")
+        return self.comments + "\n".join(blocks)
 
     def add(self, comments: str, statement: str) -> None:
         """Add a statement and the comments above it."""
@@ -193,18 +193,18 @@ class _Table:
         new = old if isinstance(value, dict) else _today(old)
         if len(old) <= 1 and isinstance(value, dict | list):
             nested: Any = {old[0]: value} if old else value
-            if (found := upgraded(nested)) != nested:
-                value = found[old[0]] if old else found
+            if (changed := upgraded(nested)) != nested:
+                value = changed[old[0]] if old else changed
                 item: Any = reduce(getitem, keys, tomlkit.parse(statement))
                 after = f" = {_inline(value)} {item.trivia.comment}".rstrip() + "\n"
         elif new[-2:] == ("weights", "kind") and value == "all_times":
             return  # which the weights say
         elif new != old:
-            *parts, name = (*way[:base], *new)[len(self.way) :]
+            *tables, name = (*way[:base], *new)[len(self.way) :]
             if len(self.way) > base:
-                inside = ".".join(parts)
+                inside = ".".join(tables)
             else:
-                name = ".".join([*parts, name])
+                name = ".".join([*tables, name])
         if not inside:
             self.own += f"{comments}{name}{after}"
             return

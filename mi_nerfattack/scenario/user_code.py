@@ -78,13 +78,13 @@ def load_function(path: str | Path, name: str) -> Callable[..., Any]:
         missing = isinstance(err, ModuleNotFoundError)
         remedy = "; install it, or put it in the folder of this file" * missing
         raise InputError(f"{path}: raised {type(err).__name__}: {err}{remedy}") from err
-    found = module.__dict__.get(name)
-    if not callable(found):
+    function = module.__dict__.get(name)
+    if not callable(function):
         known = [key for key, value in module.__dict__.items() if _own(value, module)]
         raise InputError(
             f"{path}: has no function {name!r}; it has {', '.join(known) or 'none'}"
         )
-    return found
+    return function
 
 
 def helper_files(path: str | Path) -> dict[str, Path]:
@@ -97,21 +97,23 @@ def helper_files(path: str | Path) -> dict[str, Path]:
     Returns:
         files by dotted name; empty where the file itself cannot be parsed.
     """
-    folder, found, queue = Path(path).parent, dict[str, Path](), [("", Path(path))]
+    folder, helpers, queue = Path(path).parent, dict[str, Path](), [("", Path(path))]
     while queue:
-        for name in _imported(*queue.pop()):
-            parts = name.split(".")
-            for count in range(1, len(parts) + 1):
-                dotted, place = ".".join(parts[:count]), folder.joinpath(*parts[:count])
+        package, source = queue.pop()
+        for name in _imported(package, source):
+            segments = name.split(".")
+            for count in range(1, len(segments) + 1):
+                dotted = ".".join(segments[:count])
+                place = folder.joinpath(*segments[:count])
                 candidates = place / "__init__.py", place.with_suffix(".py")
                 file = next(filter(os.path.isfile, candidates), None)
-                if file is None or parts[0] in _NO_HELPERS:
+                if file is None or segments[0] in _NO_HELPERS:
                     break
-                if dotted not in found:
-                    found[dotted] = file
+                if dotted not in helpers:
+                    helpers[dotted] = file
                     is_package = file.name == "__init__.py"
                     queue.append((dotted if is_package else _parent(dotted), file))
-    return found
+    return helpers
 
 
 def _imported(package: str, path: Path) -> Iterator[str]:
@@ -198,13 +200,17 @@ def _builtins(package: str) -> dict[str, Any]:
     """Return Python's builtins, whose imports look into a package of helpers first."""
 
     def find(
-        name: str, about: Any = None, own: Any = None, parts: Any = (), level: int = 0
+        name: str,
+        module_globals: Any = None,
+        own: Any = None,
+        fromlist: Any = (),
+        level: int = 0,
     ) -> Any:
         top = name.partition(".")[0]
         if level or f"{package}.{top}" not in _Helpers.files:
-            return builtins.__import__(name, about, own, parts, level)
-        found = builtins.__import__(f"{package}.{name}", about, own, parts)
-        return found if parts else sys.modules[f"{package}.{top}"]
+            return builtins.__import__(name, module_globals, own, fromlist, level)
+        module = builtins.__import__(f"{package}.{name}", module_globals, own, fromlist)
+        return module if fromlist else sys.modules[f"{package}.{top}"]
 
     return vars(builtins) | {"__import__": find}
 
@@ -218,7 +224,7 @@ def import_function(reference: str) -> Callable[..., Any]:
     """
     module, _, name = reference.rpartition(":")
     try:
-        found = getattr(importlib.import_module(module), name, None)
+        function = getattr(importlib.import_module(module), name, None)
     except ModuleNotFoundError as err:
         raise InputError(
             f"{reference!r}: {err}; install the package, or name a file: FILE.py:{name}"
@@ -229,9 +235,9 @@ def import_function(reference: str) -> Callable[..., Any]:
         raise InputError(
             f"{reference!r}: importing it raised {type(err).__name__}: {err}"
         ) from err
-    if not callable(found):
+    if not callable(function):
         raise InputError(f"{reference!r}: {module} has no function {name!r}")
-    return found
+    return function
 
 
 def module_file(name: str) -> Path | None:
@@ -243,12 +249,12 @@ def module_file(name: str) -> Path | None:
     Returns:
         the file that importing it would run; None where there is none.
     """
-    top, *rest = name.split(".")
+    top, *submodules = name.split(".")
     try:
         spec = importlib.util.find_spec(top)
     except ValueError:  # a module of this process without a specification
         return None
-    for part in rest:
+    for part in submodules:
         if spec is None or spec.submodule_search_locations is None:
             return None
         path = list(spec.submodule_search_locations)

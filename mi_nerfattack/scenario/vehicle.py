@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from mi_nerfattack.deploy.car import CAR, Car, Control
 from mi_nerfattack.deploy.vehicle import Motion
-from mi_nerfattack.ranges import Count, Finite, Positive, Whole
+from mi_nerfattack.ranges import Count, Finite, Natural, Positive
 from mi_nerfattack.scenario.named_file import AnyCode
 from mi_nerfattack.scenario.section import (
     Kinds,
@@ -45,7 +45,6 @@ _STABLE_RATIO = {"euler": 2.0, "rk4": 2.78, "implicit_midpoint": float("inf")}
 _FINE_RATIO, _MOST_SUBSTEPS = 0.4, 64
 #: The same that keeps a car calm which comes to rest.
 _CALM_RATIO = 2.0
-
 SteerAngle = Annotated[float, Field(gt=0, lt=90)]
 
 
@@ -55,7 +54,7 @@ class AbstractVehicleSection(Section):
     integrator: Literal["euler", "rk4", "implicit_midpoint"] = "rk4"
     dt_s: Positive = 0.1  # control period
     substeps: Count = 1  # integration steps a control period
-    delay_steps: Whole = 0  # integration steps
+    delay_steps: Natural = 0  # integration steps
     width_m: Positive = 1.8
     group: ClassVar[str] = "mi_nerfattack.vehicles"
     has_wheels: ClassVar[bool] = True
@@ -234,15 +233,16 @@ class AbstractSingleTrackSection(AbstractVehicleSection):
         self._divide("substeps", 1 / self.fastest_rate, _CALM_RATIO)
         return self
 
-    def _limits(self) -> tuple[float, float, float, float, float]:
+    def _limits(self) -> dict[str, float]:
         steer = math.radians(self.max_steer_deg)  # Dr.Jit takes no NumPy numbers
-        limits = self.max_acceleration_ms2, self.max_brake_ms2, self.stop_speed_ms
-        return self.speed_ms, steer, *limits
+        brakes = {"max_brake": self.max_brake_ms2, "stop_speed": self.stop_speed_ms}
+        most = {"max_steer": steer, "max_acceleration": self.max_acceleration_ms2}
+        return {"speed": self.speed_ms, **most, **brakes}
 
     def _accelerated(self, wheelbase: float) -> dict[str, Any]:
         most, brake = self.max_acceleration_ms2, self.max_brake_ms2
-        more = (Control("acceleration", "m/s^2", -brake, most),)
-        return _steered(wheelbase, self.max_steer_deg) | {"more_controls": more}
+        controls = (Control("acceleration", "m/s^2", -brake, most),)
+        return _steered(wheelbase, self.max_steer_deg) | {"more_controls": controls}
 
 
 class KinematicSingleTrackSection(AbstractSingleTrackSection):
@@ -253,7 +253,7 @@ class KinematicSingleTrackSection(AbstractSingleTrackSection):
 
     def build(self) -> AbstractDynamics:
         """Make the model."""
-        return KinematicSingleTrack(*self._limits(), self.wheelbase_m)
+        return KinematicSingleTrack(**self._limits(), wheelbase=self.wheelbase_m)
 
     @property
     def fastest_rate(self) -> float:
@@ -280,15 +280,15 @@ class DynamicSingleTrackSection(AbstractSingleTrackSection):
     def build(self) -> DynamicSingleTrack:
         """Make the model."""
         return DynamicSingleTrack(
-            *self._limits(),
-            self.front_axle_m,
-            self.rear_axle_m,
-            self.mass_kg,
-            self.yaw_inertia_kgm2,
-            self.front_stiffness_n_rad,
-            self.rear_stiffness_n_rad,
-            self.friction,
-            self.low_speed_ms,
+            **self._limits(),
+            front_m=self.front_axle_m,
+            rear_m=self.rear_axle_m,
+            mass=self.mass_kg,
+            yaw_inertia=self.yaw_inertia_kgm2,
+            front_stiffness=self.front_stiffness_n_rad,
+            rear_stiffness=self.rear_stiffness_n_rad,
+            friction=self.friction,
+            low_speed=self.low_speed_ms,
         )
 
     @property
@@ -297,8 +297,8 @@ class DynamicSingleTrackSection(AbstractSingleTrackSection):
         return self.build().fastest_rate
 
     def handling(self) -> dict[str, Any]:
-        found = self._accelerated(self.front_axle_m + self.rear_axle_m)
-        return found | {"mass": self.mass_kg}
+        handling = self._accelerated(self.front_axle_m + self.rear_axle_m)
+        return handling | {"mass": self.mass_kg}
 
 
 class CustomSection(AbstractVehicleSection):
@@ -366,7 +366,7 @@ class CustomSection(AbstractVehicleSection):
             function,
             size=self.state_size,
             limit=self.limits[0] if self.controls == 1 else self.limits,
-            rest=self.rest_state,
+            rest_state=self.rest_state,
             controls=self.controls,
         )
         try_model(dynamics.name, dynamics, self.limits)
@@ -377,9 +377,9 @@ class CustomSection(AbstractVehicleSection):
         steered = {"max_steer": limit} if self.control_unit == "rad" else {}
         sizes = {} if wheelbase is None else {"wheelbase": wheelbase}
         pairs = zip(user_controls(self.controls)[1:], others, strict=True)
-        more = [Control(name, "other", -most, most) for name, most in pairs]
-        found = {"max_control": limit, "control_unit": self.control_unit or "other"}
-        return {**found, **steered, **sizes, "more_controls": tuple(more)}
+        other_controls = [Control(name, "other", -most, most) for name, most in pairs]
+        steering = {"max_control": limit, "control_unit": self.control_unit or "other"}
+        return {**steering, **steered, **sizes, "more_controls": tuple(other_controls)}
 
 
 def _steered(wheelbase: float, max_steer_deg: float) -> dict[str, Any]:

@@ -91,9 +91,8 @@ class World:
 
     def __repr__(self) -> str:
         return (
-            f"World({self.route.name!r}, objects: {len(self.fields)}, "
-            f"{self.horizon} periods, {len(self.initial)} initial states, "
-            f"{', '.join(self.labels)})"
+            f"World({self.route.name!r}, objects: {len(self.fields)}, {self.horizon} "
+            f"periods, {len(self.initial)} initial states, {', '.join(self.labels)})"
         )
 
     def loop(self, sensor: AbstractSensor) -> ClosedLoop:
@@ -247,8 +246,7 @@ def driven_route(scenario: Scenario, motion: Motion) -> Route:
 
 def at_own_speed(route: Route, motion: Motion) -> Route:
     """Return a route with the vehicle's speed, where that is its own."""
-    speed = getattr(motion.dynamics, "speed", route.speed_ms)
-    return replace(route, speed_ms=speed)
+    return replace(route, speed_ms=getattr(motion.dynamics, "speed", route.speed_ms))
 
 
 def judged_frames(scenario: Scenario) -> int:
@@ -257,9 +255,8 @@ def judged_frames(scenario: Scenario) -> int:
     Raises:
         InputError: as of :func:`driven_route`.
     """
-    vehicle = scenario.vehicle
-    route = driven_route(scenario, vehicle.motion())
-    steps = scenario.drive.steps(route, vehicle.dt_s)
+    route = driven_route(scenario, scenario.vehicle.motion())
+    steps = scenario.drive.steps(route, scenario.vehicle.dt_s)
     return scenario.attack.method.rendered(steps) * scenario.attack.poses
 
 
@@ -282,15 +279,19 @@ def build_surrogate(scenario: Scenario) -> SceneSensor:
             except InputError as err:
                 raise InputError(f"{place.surrogate}: {err}") from err
         return sensor
-    posed = []
-    for item in scenario.objects:
-        posed.append(PosedField(item.load(), item.pose))
-    jitter = scenario.seed if scenario.attack.jitter else None
-    look = jitter, place.stop, place.composite, names
+    posed = [PosedField(item.load(), item.pose) for item in scenario.objects]
     assert place.field is not None  # checked by SceneSection
-    scene = _load_layer(scenario, place.field.file)
-    first = rig.cameras[0], rig.mounts[0]
-    sensor = field_sensor(scene, posed, *first, *look, spp=place.spp).with_rig(rig)
+    sensor = field_sensor(
+        _load_layer(scenario, place.field.file),
+        posed,
+        rig.cameras[0],
+        mount=rig.mounts[0],
+        jitter_seed=scenario.seed if scenario.attack.jitter else None,
+        stop=place.stop,
+        composite=place.composite,
+        names=names,
+        spp=place.spp,
+    ).with_rig(rig)
     if scenario.attack.attached:
         _require_smooth(sensor, "scene.spp")
     return sensor
@@ -336,8 +337,8 @@ def build_attack(world: World) -> AbstractAttack:
     """
     section = world.scenario.attack
     rollout, initial = build_rollout(world)
-    rest = section.freedom.build(), world.scenario.seed
-    return section.method.build(Task(rollout, world.route, initial, *rest))
+    freedom, seed = section.freedom.build(), world.scenario.seed
+    return section.method.build(Task(rollout, world.route, initial, freedom, seed))
 
 
 def load_posed(scene: SceneSection, path: Path) -> PosedField:

@@ -144,13 +144,13 @@ def _spec(item: Requirement) -> str:
 
 def _package(item: Requirement, state: str, remedy: str) -> Finding:
     try:
-        found = importlib.metadata.version(item.name)
+        version = importlib.metadata.version(item.name)
     except (importlib.metadata.PackageNotFoundError, InvalidRequirement):
         return Finding(item.name, "not installed", state, remedy)
-    if not item.specifier.contains(found, prereleases=True):
-        value = f"{found}, needed {item.specifier}"
+    if not item.specifier.contains(version, prereleases=True):
+        value = f"{version}, needed {item.specifier}"
         return Finding(item.name, value, state, remedy)
-    return Finding(item.name, found)
+    return Finding(item.name, version)
 
 
 def _llvm() -> Finding:

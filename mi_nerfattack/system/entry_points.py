@@ -112,8 +112,8 @@ def register_plugin(name: str) -> bool:
 
 def plugin_packages(types: Sequence[str]) -> str:
     """Return the packages that offer Mitsuba plugins of these types; "" for none."""
-    found = sorted(set(types) & set(names(PLUGINS)))
-    return ", ".join(_load(PLUGINS, name).package for name in found)
+    plugins = sorted(set(types) & set(names(PLUGINS)))
+    return ", ".join(_load(PLUGINS, name).package for name in plugins)
 
 
 class _reported:

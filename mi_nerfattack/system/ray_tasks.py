@@ -77,12 +77,14 @@ class RayTasks(AbstractWorkers):
     def _connect(self) -> Any:
         os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # it tells its makers otherwise
         ray = load_extra("ray", "Ray")
-        more = {}
+        options = {}
         if self.address == LOCAL:
             count = self.count and self.count * self.cores
-            more = {"include_dashboard": False, "num_cpus": count}
+            options = {"include_dashboard": False, "num_cpus": count}
         try:
-            ray.init(self.address, log_to_driver=False, logging_level="error", **more)
+            ray.init(
+                self.address, log_to_driver=False, logging_level="error", **options
+            )
         except (ConnectionError, RuntimeError, ValueError) as err:
             raise SetupError(
                 f"Ray: {self.address!r}: {err}; start a cluster with 'ray start "
@@ -111,5 +113,5 @@ def _error(ray: Any, piece: int, ended: Any) -> Exception | None:
     try:
         return failure(piece, ray.get(ended))
     except ray.exceptions.RayError as err:
-        told = " ".join(str(err).split())[:500]
-        return InputError(f"a task of Ray ended in piece {piece}: {told}")
+        message = " ".join(str(err).split())[:500]
+        return InputError(f"a task of Ray ended in piece {piece}: {message}")

@@ -16,7 +16,7 @@ from mi_nerfattack.system.workers import (
     AbstractWorkers,
     OnEnd,
     OnUnits,
-    Told,
+    Outcome,
     do_alone,
     failure,
 )
@@ -93,9 +93,9 @@ def _error(piece: int, job: Any, errors: Any) -> Exception | None:
     try:
         return failure(piece, job.result())
     except errors.UncompletedJobError as err:
-        told = str(err).splitlines()[-1]
+        message = str(err).splitlines()[-1]
         return InputError(
-            f"job {job.job_id} ended in piece {piece}, {job.state}: {told}; see "
+            f"job {job.job_id} ended in piece {piece}, {job.state}: {message}; see "
             f"{job.paths.stderr}, and give more memory if it ran out of it"
         )
 
@@ -107,7 +107,7 @@ class _Piece:
     work: AbstractWork
     index: int
 
-    def __call__(self) -> Told:
+    def __call__(self) -> Outcome:
         return do_alone(self.work, self.index)
 
     def checkpoint(self) -> Any:

@@ -39,7 +39,7 @@ OnEnd = Callable[[int, Exception | None], None]
 
 #: What became of a piece, as one process tells another: "done"; "error" or "refused"
 #: and a message; or "bug" and a traceback.
-Told = tuple[str, str]
+Outcome = tuple[str, str]
 
 
 def tally(progress: Callable[[int, int], None], done: int, total: int) -> OnUnits:
@@ -88,7 +88,7 @@ class AbstractWork(ABC):
         """Let go of what `open` returned."""
 
 
-def do_alone(work: AbstractWork, index: int) -> Told:
+def do_alone(work: AbstractWork, index: int) -> Outcome:
     """Do one piece in a process that does nothing else, and return the outcome."""
     _use_one_thread()
     try:
@@ -102,9 +102,9 @@ def do_alone(work: AbstractWork, index: int) -> Told:
     return "done", ""
 
 
-def failure(piece: int, told: Told) -> Exception | None:
+def failure(piece: int, outcome: Outcome) -> Exception | None:
     """Return the error of a piece from another process; None if the piece is done."""
-    kind, text = told
+    kind, text = outcome
     if kind in ("error", "refused"):
         return (InputError if kind == "error" else RefusedError)(text)
     return RuntimeError(f"piece {piece} failed:\n{text}") if kind == "bug" else None
@@ -220,8 +220,8 @@ class _Member:
         context = multiprocessing.get_context("spawn")  # Dr.Jit is not fork-safe
         self.connection, theirs = context.Pipe()
         self.piece, self.done = 0, 0
-        about = work, theirs, _variant()
-        self._process = context.Process(target=_serve, args=about, daemon=True)
+        arguments = work, theirs, _variant()
+        self._process = context.Process(target=_serve, args=arguments, daemon=True)
         with safe_path(), blocked_interrupts():
             self._process.start()
         theirs.close()  # so that its end is noticed
@@ -255,12 +255,12 @@ class _Member:
     def _end(self) -> InputError:
         self._process.join(10)
         code = self._process.exitcode
-        how = (
+        ending = (
             f"signal {-code}" if code is not None and code < 0 else f"exit code {code}"
         )
         memory = "; it may have run out of memory: use fewer workers" * (code == -9)
         return InputError(
-            f"a worker process ended by {how} in piece {self.piece}{memory}; "
+            f"a worker process ended by {ending} in piece {self.piece}{memory}; "
             "finished pieces are kept, the same command continues"
         )
 
@@ -330,7 +330,7 @@ def _use_one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def _failed(error: Exception) -> Told:
+def _failed(error: Exception) -> Outcome:
     if isinstance(error, NerfAttackError):
         return "refused" if isinstance(error, RefusedError) else "error", str(error)
     if isinstance(error, MemoryError):

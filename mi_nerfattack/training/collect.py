@@ -263,8 +263,8 @@ def _arc_lengths(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 def _digest(routes: Sequence[Route]) -> str:
     """Return a checksum of names, goals, lanes' widths, speeds, points and shapes."""
-    about = [
+    rows = [
         [r.name, r.goal, r.lane_width_m, r.speed_ms, r.closed, r.points.tolist()]
         for r in routes
     ]
-    return json_digest(about)
+    return json_digest(rows)

@@ -231,12 +231,12 @@ def find_shards(folder: str | Path) -> list[Path]:
     Raises:
         InputError: there are none.
     """
-    found = sorted(Path(folder).rglob(SHARDS))
-    if not found:
+    shards = sorted(Path(folder).rglob(SHARDS))
+    if not shards:
         raise InputError(
             f"{folder}: no frames in it; give a folder of 'mi-nerfattack train'"
         )
-    return found
+    return shards
 
 
 def control_unit_of(shard: Path) -> str | None:
@@ -268,10 +268,10 @@ def divide_shards(
     if least:
         count = min(max(count, least), len(shards) - 1)
     held = set(np.argsort(drawn, kind="stable")[:count].tolist())
-    parts: tuple[list[Path], list[Path]] = [], []
+    groups: tuple[list[Path], list[Path]] = [], []
     for index, shard in enumerate(shards):
-        parts[index in held].append(shard)
-    return parts
+        groups[index in held].append(shard)
+    return groups
 
 
 def _draw_of(shard: Path) -> float:

@@ -19,11 +19,7 @@ from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, MOST_GOALS, PilotNet
 from mi_nerfattack.rollout.drive import departure_limits
 from mi_nerfattack.system.workers import AbstractWorkers
 from mi_nerfattack.training.collect import OnFrames, collect
-from mi_nerfattack.training.dataset import (
-    FrameDataset,
-    control_unit_of,
-    divide_shards,
-)
+from mi_nerfattack.training.dataset import FrameDataset, control_unit_of, divide_shards
 from mi_nerfattack.training.settings import ImitationSettings
 from mi_nerfattack.training.sources import AbstractSource, PolicyDrives
 from mi_nerfattack.training.staging import ROADSIDE, AbstractStaging
@@ -61,7 +57,7 @@ def imitate(
     workers: AbstractWorkers,
     progress: OnStage = lambda stage, done, total, state: None,
     start: PilotNet | None = None,
-    more: Sequence[Path] = (),
+    earlier_shards: Sequence[Path] = (),
     staging: AbstractStaging = ROADSIDE,
 ) -> Imitated:
     """Train a policy to follow the lane, and measure it in the closed loop.
@@ -77,17 +73,17 @@ def imitate(
         workers: who collects.
         progress: called often; an exception from it stops the work.
         start: weights to begin with; None for random ones.
-        more: shards of earlier collections to train on, too.
+        earlier_shards: shards of earlier collections to train on, too.
         staging: of all collections, see `collect`.
 
     Raises:
         InputError: before the first frame, no frames are wanted, or another process
             works in the folder. A site is unknown or cannot be opened, or objects find
-            no place. A camera, a route, first weights or frames of `more` do not fit.
-            Later, the folder holds results of other settings.
+            no place. A camera, a route, first weights or frames of `earlier_shards`
+            do not fit. Later, the folder holds results of other settings.
     """
-    _check_wanted(sites, routes, settings, more)
-    _check_policy(sites, routes, settings, more)
+    _check_counts(sites, routes, settings, earlier_shards)
+    _check_policy(sites, routes, settings, earlier_shards)
     _check_places(sites, routes, settings, (settings.validation, settings.final))
     torch.manual_seed(settings.seed)
     car = sites[0].car
@@ -97,13 +93,20 @@ def imitate(
     module = PilotNet(goals, car.max_control, car.control_unit)
     if start is not None:
         _take_weights(module, start)
-    if more:
-        _check_frames(module, more)
+    if earlier_shards:
+        _check_frames(module, earlier_shards)
     with exclusive(files.make_folder(folder)):
         remove_partial(folder)  # of killed writers
-        arguments = (settings, Path(folder), workers, progress, staging)
-        run = _Imitation(sites, routes, *arguments)
-        return run.run(module, more)
+        run = _Imitation(
+            sites,
+            routes,
+            settings,
+            folder=Path(folder),
+            workers=workers,
+            progress=progress,
+            staging=staging,
+        )
+        return run.run(module, earlier_shards)
 
 
 def collect_frames(
@@ -120,12 +123,19 @@ def collect_frames(
     Images may have any size. If they have PilotNet's, `imitate` with the same arguments
     trains on these frames. Arguments and errors are those of `imitate`.
     """
-    _check_wanted(sites, routes, settings, ())
+    _check_counts(sites, routes, settings, ())
     _check_places(sites, routes, settings, ())
     with exclusive(files.make_folder(folder)):
         remove_partial(folder)  # of killed writers
-        arguments = (settings, Path(folder), workers, progress, staging)
-        run = _Imitation(sites, routes, *arguments)
+        run = _Imitation(
+            sites,
+            routes,
+            settings,
+            folder=Path(folder),
+            workers=workers,
+            progress=progress,
+            staging=staging,
+        )
         first, held_out = run.collect_first()
         return [*first, *held_out]
 
@@ -145,11 +155,11 @@ class _Imitation:
     held_out: list[Path] = field(default_factory=list)
     _loop: ClosedLoop | None = None
 
-    def run(self, module: PilotNet, more: Sequence[Path]) -> Imitated:
+    def run(self, module: PilotNet, earlier_shards: Sequence[Path]) -> Imitated:
         """Do all stages, beginning with the weights of `module`."""
         settings = self.settings
         first, held_out = self.collect_first()
-        self.take([*more, *first])
+        self.take([*earlier_shards, *first])
         self.held_out += held_out
         with self:
             history = [self.train(module, 0)]
@@ -158,8 +168,8 @@ class _Imitation:
                 drives = PolicyDrives(
                     weights[-1], settings.horizon, settings.expert_share
                 )
-                wanted = settings.dagger_frames
-                self.take(self.collect(f"round_{number}", wanted, drives, number))
+                frames = settings.dagger_frames
+                self.take(self.collect(f"round_{number}", frames, drives, number))
                 history.append(self.train(module, number))
                 weights.append(self.save(module, number))
             ranks = [
@@ -173,12 +183,12 @@ class _Imitation:
     def __enter__(self) -> _Imitation:
         """Load what validation drives in, after the workers have gone."""
         site, settings = self.sites[0], self.settings
-        wanted = max(settings.validation.most, settings.final.most)
+        object_count = max(settings.validation.most, settings.final.most)
         self._loop = ClosedLoop(
             [site.open(site.typical()) for site in self._validated()],
             self.routes,
-            site.load_objects(wanted),
-            site.load_surroundings() if wanted else None,
+            site.load_objects(object_count),
+            site.load_surroundings() if object_count else None,
             self.settings.validation,
             self.settings.validate_every,
             self._shown("validation"),
@@ -203,25 +213,28 @@ class _Imitation:
         """Collect the frames of the first training, and the held-out ones, if any."""
         settings, source = self.settings, self.settings.cloning
         first = self.collect("round_0", settings.frames, source, 0)
-        wanted = settings.validation_frames
-        return first, self.collect("held_out", wanted, source, _HELD_OUT)
+        frames = settings.validation_frames
+        return first, self.collect("held_out", frames, source, _HELD_OUT)
 
     def collect(
         self, name: str, frames: Mapping[str, int], source: AbstractSource, number: int
     ) -> list[Path]:
         """Collect frames of all sites; returns the shards."""
         shards: list[Path] = []
+        settings = replace(self.settings.collecting, seed=self._seed(number))
         for site in self.sites:
             if not frames.get(site.name):
                 continue
-            settings = replace(
-                self.settings.collecting,
-                frames=frames[site.name],
-                seed=self._seed(number),
+            shards += collect(
+                site,
+                self.routes,
+                source,
+                settings=replace(settings, frames=frames[site.name]),
+                folder=self.folder / name,
+                workers=self.workers,
+                progress=self._shown(f"{name}, {site.name}", "{}/{} frames"),
+                staging=self.staging,
             )
-            arguments = (settings, self.folder / name, self.workers)
-            show = self._shown(f"{name}, {site.name}", "{}/{} frames")
-            shards += collect(site, self.routes, source, *arguments, show, self.staging)
         return shards
 
     def take(self, shards: Sequence[Path]) -> None:
@@ -290,17 +303,17 @@ class _Imitation:
         )
 
 
-def _check_wanted(
+def _check_counts(
     sites: Sequence[AbstractSite],
     routes: Sequence[Route],
     settings: ImitationSettings,
-    more: Sequence[Path],
+    earlier_shards: Sequence[Path],
 ) -> None:
     names = [site.name for site in sites]
     if unknown := sorted(set(settings.sites) - set(names)):
         raise InputError(f"frames: of {', '.join(unknown)}; there is {names}")
     frames = sum(settings.frames.values())
-    if not sites or not routes or not (frames or more):
+    if not sites or not routes or not (frames or earlier_shards):
         raise InputError(
             f"imitate: {frames} frames of {names}, {len(routes)} routes; at least one "
             "frame and one route"
@@ -311,7 +324,7 @@ def _check_policy(
     sites: Sequence[AbstractSite],
     routes: Sequence[Route],
     settings: ImitationSettings,
-    more: Sequence[Path],
+    earlier_shards: Sequence[Path],
 ) -> None:
     """Raise `InputError` for what PilotNet cannot be trained on."""
     frames = sum(settings.frames.values())
@@ -324,7 +337,7 @@ def _check_policy(
     for site in sites:
         check_site(site)
     size = settings.collecting.shard
-    count = len(more) + sum(-(-n // size) for n in settings.frames.values())
+    count = len(earlier_shards) + sum(-(-n // size) for n in settings.frames.values())
     if settings.holds_out_shards and count < 2:
         raise InputError(
             f"frames: {frames}, one shard of up to {size}; at least two, of which one "
@@ -342,8 +355,8 @@ def _check_places(
     for drives in measured:
         departure_limits(routes, drives.car_width_m)
     collecting = settings.collecting
-    wanted = collecting.objects if collecting.object_share else 0
-    most = max([wanted, *(drives.most for drives in measured)])
+    object_count = collecting.objects if collecting.object_share else 0
+    most = max([object_count, *(drives.most for drives in measured)])
     objects = sites[0].load_objects(most) if most else []
     if objects:
         surroundings = sites[0].load_surroundings()
@@ -351,7 +364,7 @@ def _check_places(
             check_places(sites[0].period, routes, objects, surroundings, drives)
         # near the ends of a route there may be no place; somewhere there must
         rng, rule = np.random.default_rng(settings.seed), collecting.roadside
-        for route in routes if wanted else ():
+        for route in routes if object_count else ():
             rule.draw(objects[:1], surroundings, route, (0.0, route.length), rng)
     # what cannot be made is told now, not after the hours of those before it
     for site in sites:

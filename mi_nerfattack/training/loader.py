@@ -92,11 +92,11 @@ class Frames(torch.utils.data.Dataset[Frame]):
             kind = metadata["settings.waypoints_s"], control_unit_of(path)
             kinds.setdefault(kind, path)
         if len(kinds) > 1:
-            found = "; ".join(
+            listing = "; ".join(
                 f"{path}: waypoints after {times} s, controls in {unit}"
                 for (times, unit), path in kinds.items()
             )
-            raise InputError(f"{found}: give a folder whose frames have the same")
+            raise InputError(f"{listing}: give a folder whose frames have the same")
         self._data = FrameDataset.from_shards(shards)
         self._columns = {
             name: np.concatenate([column[name] for column in columns])

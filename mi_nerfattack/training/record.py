@@ -70,7 +70,7 @@ def training_record(
         command: that was given.
     """
     described = {site.name: site.describe() for site in sites}
-    sums = [about.pop("files", {}) for about in described.values()]
+    sums = [description.pop("files", {}) for description in described.values()]
     return TrainingRecord(
         environments=result.card,
         training=result.history,
@@ -109,9 +109,9 @@ def read_record(path: Path) -> TrainingRecord | None:
     Raises:
         InputError: unreadable, or no JSON.
     """
-    found = files.read_json(path)
+    document = files.read_json(path)
     try:
-        return TrainingRecord.model_validate(found)
+        return TrainingRecord.model_validate(document)
     except ValidationError:
         return None
 

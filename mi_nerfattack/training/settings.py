@@ -9,7 +9,7 @@ from mi_nerfattack.deploy.place import Scatter
 from mi_nerfattack.deploy.roadside.rule import Roadside
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import EvaluateSettings
-from mi_nerfattack.ranges import Count, Fraction, Positive, Share, Whole, checked
+from mi_nerfattack.ranges import Count, Fraction, Natural, Positive, Share, checked
 from mi_nerfattack.training.sources import (
     AbstractSource,
     ExpertDrives,
@@ -104,15 +104,15 @@ class ImitationSettings:
         final: of those at the end.
     """
 
-    frames: Mapping[str, Whole]
-    validation_frames: Mapping[str, Whole] = field(default_factory=dict)
-    dagger_rounds: Whole = 0
-    dagger_frames: Mapping[str, Whole] = field(default_factory=dict)
+    frames: Mapping[str, Natural]
+    validation_frames: Mapping[str, Natural] = field(default_factory=dict)
+    dagger_rounds: Natural = 0
+    dagger_frames: Mapping[str, Natural] = field(default_factory=dict)
     dagger_epochs: Count = 3
     dagger_rate: Fraction = 5e-4
     expert_share: Share = 0.0
     horizon: Count = 16
-    seed: Whole = 0
+    seed: Natural = 0
     validate_every: Count = 4
     validate_in: tuple[str, ...] = ()
     cloning: AbstractSource = CLONING
@@ -133,9 +133,9 @@ class ImitationSettings:
     @property
     def sites(self) -> tuple[str, ...]:
         """Names of the sites of which frames are wanted, and of `validate_in`."""
-        parts = [self.frames, self.validation_frames]
-        parts += [self.dagger_frames] if self.dagger_rounds else []
-        names = [name for part in parts for name in part if part[name]]
+        counts = [self.frames, self.validation_frames]
+        counts += [self.dagger_frames] if self.dagger_rounds else []
+        names = [name for by_site in counts for name in by_site if by_site[name]]
         return tuple(dict.fromkeys([*names, *self.validate_in]))
 
     @property

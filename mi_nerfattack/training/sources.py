@@ -87,8 +87,8 @@ class Scenery:
     def label(self, image: np.ndarray, step: int) -> Labelled:
         """Add the vehicle's pose and the expert's control to the image of a step."""
         state = self.environment.state
-        found = self.expert.control(state)
-        control = float(found[0]) if found.ndim == 1 else found[0]
+        controls = self.expert.control(state)
+        control = float(controls[0]) if controls.ndim == 1 else controls[0]
         return Labelled(image, control, np.array(state[:3], np.float64), step)
 
     @property
@@ -228,8 +228,8 @@ class Mixture(AbstractSource):
 
     def describe(self) -> dict[str, Any]:
         """Return all parts."""
-        parts = [source.describe() for source in self.sources]
-        return {"kind": self.kind, "sources": parts, "shares": list(self.shares)}
+        descriptions = [source.describe() for source in self.sources]
+        return {"kind": self.kind, "sources": descriptions, "shares": list(self.shares)}
 
     def prepare(self) -> list[Any]:
         """Prepare all parts."""

@@ -83,8 +83,8 @@ class _RandomStage(AbstractStage):
         self, site: AbstractSite, routes: Sequence[Route], settings: CollectSettings
     ) -> None:
         self._routes, self._settings = routes, settings
-        wanted = settings.object_share > 0
-        self._fields = site.load_objects(settings.objects) if wanted else []
+        has_objects = settings.object_share > 0
+        self._fields = site.load_objects(settings.objects) if has_objects else []
         self._own = [item.texture.numpy().copy() for item in self._fields]
         self._surroundings = site.load_surroundings() if self._fields else None
         lengths = np.array([route.length for route in routes])

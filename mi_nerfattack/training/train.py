@@ -119,8 +119,8 @@ def fit_policy(
         check_labels(module, held_out)
         train_rows, held = np.arange(len(data)), Part.of_all(held_out)
     module.to(device).requires_grad_(True)
-    parts = Part(data, train_rows), held
-    run = _Run(module, parts, settings, device, validation or LossAlone(), checkpoint)
+    split = Part(data, train_rows), held
+    run = _Run(module, split, settings, device, validation or LossAlone(), checkpoint)
     run.restore()
     for epoch in range(len(run.history), settings.epochs):
         train_loss = run.epoch(epoch, progress)
@@ -155,14 +155,14 @@ class _Run:
     def __init__(
         self,
         module: PilotNet,
-        parts: tuple[Part, Part],
+        split: tuple[Part, Part],
         settings: TrainSettings,
         device: str,
         validation: AbstractValidation,
         checkpoint: str | Path | None,
     ) -> None:
         self.module, self.settings, self.validation = module, settings, validation
-        self.part, self.held = parts
+        self.part, self.held = split
         self.device = torch.device(device)
         self.steps = -(-len(self.part.rows) // settings.batch)
         self.optimiser = torch.optim.AdamW(
@@ -208,13 +208,13 @@ class _Run:
     def validate(self) -> tuple[float, float]:
         """Compute the held-out loss and the mean absolute error in rad/s."""
         self.module.eval()
-        rows, parts = self.held.rows, []
+        rows, errors = self.held.rows, []
         for start in range(0, len(rows), 256):
             chosen = rows[start : start + 256]
             frames, goal, control = self._batch(self.held.data, chosen)
             image = frames.permute(0, 3, 1, 2).float().div_(255)
-            parts.append(self._error(image, goal, control))
-        error = torch.cat(parts)
+            errors.append(self._error(image, goal, control))
+        error = torch.cat(errors)
         mean = error.abs().mean() * self.module.max_control
         return error.square().mean().item(), mean.item()
 
@@ -251,13 +251,13 @@ class _Run:
 
     def restore(self) -> None:
         """Read what `save` wrote, where there is something."""
-        kept = None if self.checkpoint is None else self.checkpoint.read()
-        if kept is None:
+        checkpoint = None if self.checkpoint is None else self.checkpoint.read()
+        if checkpoint is None:
             return
         groups: dict[str, dict[str, torch.Tensor]] = {}
-        for name, value in kept.tensors.items():
-            group, _, rest = name.partition(".")
-            groups.setdefault(group, {})[rest] = torch.from_numpy(value)
+        for name, value in checkpoint.tensors.items():
+            group, _, suffix = name.partition(".")
+            groups.setdefault(group, {})[suffix] = torch.from_numpy(value)
         self.module.load_state_dict(groups["last"])
         self.best = groups["best"]
         state = self.optimiser.state_dict()
@@ -265,11 +265,11 @@ class _Run:
             index, _, key = name.partition(".")
             state["state"].setdefault(int(index), {})[key] = value
         self.optimiser.load_state_dict(state)
-        self.history = kept.record.history
+        self.history = checkpoint.record.history
 
     def _identity(self) -> dict[str, str]:
         """Describe all on which a continued run must agree."""
-        about = {
+        identity = {
             "version": versions(),
             "settings": asdict(self.settings),
             "validation": self.validation.describe(),
@@ -279,8 +279,11 @@ class _Run:
             "goals": self.module.goals,
             "max_control": self.module.max_control,
         }
-        parts = [flatten(name, value) for name, value in about.items()]
-        return {"format": FORMAT, **{k: v for part in parts for k, v in part.items()}}
+        tables = [flatten(name, value) for name, value in identity.items()]
+        return {
+            "format": FORMAT,
+            **{k: v for table in tables for k, v in table.items()},
+        }
 
     def _batch(self, data: FrameDataset, rows: np.ndarray) -> tuple[torch.Tensor, ...]:
         """Read frames (uint8), goals and controls in [-1, 1] onto the device."""
@@ -328,8 +331,8 @@ def check_labels(module: PilotNet, data: FrameDataset) -> None:
 
 def check_site(site: AbstractSite) -> None:
     """Raise `InputError` unless PilotNet takes a site's images, and drives its car."""
-    if more := site.car.more_controls:
-        names = ", ".join(control.name for control in more)
+    if controls := site.car.more_controls:
+        names = ", ".join(control.name for control in controls)
         raise InputError(
             f"car of {site.name!r}: takes {names} besides its steering; PilotNet gives "
             "the steering alone: collect frames alone ('mi-nerfattack train "

@@ -120,8 +120,15 @@ class ClosedLoop(AbstractValidation):
         """Drive, and return all figures; see `evaluation.evaluate.evaluate`."""
         # the parameters of a policy that drives are frozen
         policy = TorchPolicy(copy.deepcopy(module))
-        arguments = (self.routes, self.objects, self.surroundings, self.settings)
-        return evaluate(policy, self.environments, *arguments, self.progress)
+        return evaluate(
+            policy,
+            self.environments,
+            self.routes,
+            objects=self.objects,
+            surroundings=self.surroundings,
+            settings=self.settings,
+            progress=self.progress,
+        )
 
     def describe(self) -> dict[str, Any]:
         """Return names and settings."""

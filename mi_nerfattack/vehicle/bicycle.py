@@ -95,10 +95,10 @@ class RateLimitedAckermann(AbstractDynamics):
         """Compute (4, n) from state (4, n) and commanded angle (n,) in radians."""
         sin, cos = dr.sincos(state[2])
         heading_rate = self.speed / self.wheelbase * dr.tan(state[3])
-        wanted = (control - state[3]) / self.time_constant
-        steer_rate = soft_limit(wanted, self.max_steer_rate)
-        along = self.speed * cos, self.speed * sin
-        return type(state)(*along, heading_rate, steer_rate)
+        unlimited_rate = (control - state[3]) / self.time_constant
+        steer_rate = soft_limit(unlimited_rate, self.max_steer_rate)
+        v_x, v_y = self.speed * cos, self.speed * sin
+        return type(state)(v_x, v_y, heading_rate, steer_rate)
 
     def saturate(self, control: Any) -> Any:
         """Limit the commanded angle (n,) with `soft_limit`."""

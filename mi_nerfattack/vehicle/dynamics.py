@@ -93,16 +93,16 @@ def control_size(control: Any) -> int:
     return 1 if dr.depth_v(control) == 1 else len(control)
 
 
-def require_controls(given: int, names: Sequence[str]) -> None:
+def require_controls(count: int, names: Sequence[str]) -> None:
     """Raise `InputError` unless a policy gives as many controls as its vehicle takes.
 
     Args:
-        given: number of controls of an image.
+        count: number of controls of an image.
         names: of the controls that the vehicle takes.
     """
-    if given != len(names):
+    if count != len(names):
         raise InputError(
-            f"controls: the policy gives {given}, the vehicle takes {len(names)}: "
+            f"controls: the policy gives {count}, the vehicle takes {len(names)}: "
             f"{', '.join(names)}; let the policy return so many, in this order, or "
             "take another vehicle"
         )

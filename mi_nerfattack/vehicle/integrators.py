@@ -65,10 +65,10 @@ def _substitute(rows: list[list[Any]]) -> list[Any]:
     size = len(rows)
     solution: list[Any] = [None] * size
     for i in reversed(range(size)):
-        rest = rows[i][size]
+        remainder = rows[i][size]
         for j in range(i + 1, size):
-            rest = rest - rows[i][j] * solution[j]
-        solution[i] = rest / rows[i][i]
+            remainder = remainder - rows[i][j] * solution[j]
+        solution[i] = remainder / rows[i][i]
     return solution
 
 
@@ -338,9 +338,9 @@ class Transition:
         inputs = state, *controls
         return vjp(lambda x: self._advance(*x)[-1], inputs, cotangent)
 
-    def _beside(self, state: Any, *more: Any) -> list[Any]:
+    def _beside(self, state: Any, *inputs: Any) -> list[Any]:
         """Return what a recording depends on beside the arguments, their sizes too."""
-        sizes, shares = [dr.width(x) for x in (state, *more)], self.shares(state)
+        sizes, shares = [dr.width(x) for x in (state, *inputs)], self.shares(state)
         weights = [] if shares is None else shares.weights
         return [sizes, self.dynamics.constants(state), weights]
 
@@ -368,10 +368,12 @@ class Shares:
             substeps: integration steps a period.
             kind: type of a row of their states.
         """
-        whole = np.floor(delays)
-        part, step = delays - whole, np.arange(substeps)[:, None]
+        full_steps = np.floor(delays)
+        part, step = delays - full_steps, np.arange(substeps)[:, None]
         # periods since the two controls that arrive in a step, (substeps, n)
-        later, earlier = (-((step - n) // substeps) for n in (whole, whole + 1))
+        later, earlier = (
+            -((step - n) // substeps) for n in (full_steps, full_steps + 1)
+        )
         newest, oldest = int(later.min()), int(earlier.max())
         ages = np.arange(oldest, newest - 1, -1)[:, None]
         weights = [

@@ -34,7 +34,7 @@ class TorchDynamics(AbstractUserDynamics):
         size: m, at least 3; the first columns are px, py, theta.
         limit: of ``|control|``, in its unit; applied by `soft_limit`. Of several
             controls one for all, or one for each.
-        rest: initial values of the m - 3 columns after theta; zeros if left out.
+        rest_state: initial values of the m - 3 columns after theta; zeros if left out.
         controls: k, their number.
     """
 
@@ -67,12 +67,12 @@ class TorchDynamics(AbstractUserDynamics):
         result = call_model(self.name, self.function, state, control)
         if not isinstance(result, torch.Tensor) or result.shape != state.shape:
             shape = getattr(result, "shape", None)
-            found = type(result).__name__ + (
+            description = type(result).__name__ + (
                 f" of shape {tuple(shape)}" if shape else ""
             )
             raise InputError(
-                f"{self.name}: returned {found}; a tensor {tuple(state.shape)} is "
-                "needed, a row for each vehicle"
+                f"{self.name}: returned {description}; a tensor {tuple(state.shape)} "
+                "is needed, a row for each vehicle"
             )
         require_finite(self.name, result.detach().cpu().numpy())
         return result.to(state)
@@ -111,7 +111,7 @@ class TorchDynamics(AbstractUserDynamics):
         """Evaluate with a graph; return the result and the leaves."""
         leaves = state.requires_grad_(), control.requires_grad_()
         with torch.enable_grad():
-            return self.evaluate(*leaves), leaves
+            return self.evaluate(state, control), leaves
 
     def _reverse(
         self,
@@ -148,18 +148,16 @@ class _Derivative(dr.CustomOp):
 
     def forward(self) -> None:
         count = dr.width(self.state)
-        tangents = (
-            _to_columns(self.grad_in("state"), count),
-            _to_columns(self.grad_in("control"), count),
-        )
-        point = _tensors(self.state, self.control)
-        result = self.dynamics.jvp(*point, *tangents)
+        d_state = _to_columns(self.grad_in("state"), count)
+        d_control = _to_columns(self.grad_in("control"), count)
+        state, control = _tensors(self.state, self.control)
+        result = self.dynamics.jvp(state, control, d_state, d_control=d_control)
         self.set_grad_out(_to_state(result, self.state))
 
     def backward(self) -> None:
         cotangent = _to_columns(self.grad_out(), dr.width(self.state))
-        point = _tensors(self.state, self.control)
-        by_state, by_control = self.dynamics.vjp(*point, cotangent)
+        state, control = _tensors(self.state, self.control)
+        by_state, by_control = self.dynamics.vjp(state, control, cotangent)
         self.set_grad_in("state", _to_state(by_state, self.state))
         if by_control.ndim == 1:
             self.set_grad_in("control", _to_row(by_control, type(self.control)))

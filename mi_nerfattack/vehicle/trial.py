@@ -65,17 +65,17 @@ def require_model(name: str, dynamics: AbstractDynamics, state: Any, u: Any) -> 
     columns = [*dynamics.jacobian(state, u), *_by_controls(dynamics, state, u)]
     size = len(state)
     for j, column in enumerate(columns):
-        found = np.broadcast_to(column.numpy(), value.shape)
+        derivative = np.broadcast_to(column.numpy(), value.shape)
         source = (
             f"row {j} of the state" if j < size else _control_name(dynamics, j - size)
         )
-        if not np.isfinite(found).all():
+        if not np.isfinite(derivative).all():
             raise InputError(
-                f"{name}: its derivative by {source} is {found[:, 0].tolist()}; finite "
-                "numbers are needed"
+                f"{name}: its derivative by {source} is {derivative[:, 0].tolist()}; "
+                "finite numbers are needed"
             )
         slope = _difference(dynamics, state, u, j)
-        lost = (found == 0).all(axis=1) & (np.abs(slope) > VISIBLE).any(axis=1)
+        lost = (derivative == 0).all(axis=1) & (np.abs(slope) > VISIBLE).any(axis=1)
         if lost.any():
             row = int(np.flatnonzero(lost)[0])
             raise InputError(
@@ -126,8 +126,8 @@ def _difference(dynamics: AbstractDynamics, state: Any, u: Any, row: int) -> np.
         rows = [type(item)(item) for item in (*state, *_rows(u))]
         step = STEP * (1 + np.abs(rows[row].numpy()))
         rows[row] += type(rows[row])(sign * step)
-        moved = type(state)(*rows[:size]), _joined(rows[size:], u)
-        ends.append(_values(dynamics, *moved) / (2 * step))
+        moved_state, moved_u = type(state)(*rows[:size]), _joined(rows[size:], u)
+        ends.append(_values(dynamics, moved_state, moved_u) / (2 * step))
     return ends[0] - ends[1]
 
 

@@ -25,7 +25,7 @@ class AbstractUserDynamics(AbstractDynamics):
     function: Callable[[Any, Any], Any]
     size: Annotated[int, Field(ge=3)] = 3
     limit: Positive | tuple[Positive, ...] = 1.0
-    rest: tuple[float, ...] = ()
+    rest_state: tuple[float, ...] = ()
     controls: Count = 1
 
     def __post_init__(self) -> None:
@@ -35,11 +35,15 @@ class AbstractUserDynamics(AbstractDynamics):
                 f"{type(self).__name__}.limit: {self.limit!r}; one number, or "
                 f"{self.controls} numbers, one for each control"
             )
-        more = self.size - 3
-        if len(self.rest) not in (0, more) or not np.isfinite(self.rest).all():
+        n_extra = self.size - 3
+        if (
+            len(self.rest_state) not in (0, n_extra)
+            or not np.isfinite(self.rest_state).all()
+        ):
             raise InputError(
-                f"{type(self).__name__}.rest: {self.rest!r}; {more} finite numbers are "
-                f"needed, one for each row after theta of a state of {self.size}"
+                f"{type(self).__name__}.rest_state: {self.rest_state!r}; {n_extra} "
+                "finite numbers are needed, one for each row after theta of a state of "
+                f"{self.size}"
             )
 
     @property
@@ -53,8 +57,8 @@ class AbstractUserDynamics(AbstractDynamics):
         return self.size
 
     def extend(self, poses: np.ndarray) -> np.ndarray:
-        """Append `rest` to poses (n, 3): (n, m)."""
-        return append_rows(poses, self.rest or (0.0,) * (self.size - 3))
+        """Append `rest_state` to poses (n, 3): (n, m)."""
+        return append_rows(poses, self.rest_state or (0.0,) * (self.size - 3))
 
     def saturate(self, control: Any) -> Any:
         """Limit the control (n,), or each of (k, n), with `soft_limit`."""
@@ -76,7 +80,7 @@ class FunctionDynamics(AbstractUserDynamics):
     >>> def car(state, control):
     ...     _, _, theta, speed = state
     ...     return speed * dr.cos(theta), speed * dr.sin(theta), control, 8 - speed
-    >>> FunctionDynamics(car, size=4, limit=1.5, rest=(5.0,)).state_size
+    >>> FunctionDynamics(car, size=4, limit=1.5, rest_state=(5.0,)).state_size
     4
 
     Args:
@@ -88,7 +92,7 @@ class FunctionDynamics(AbstractUserDynamics):
         size: m, at least 3; the first rows are px, py, theta.
         limit: of ``|control|``, in its unit; applied by `soft_limit`. Of several
             controls one for all, or one for each.
-        rest: initial values of the m - 3 rows after theta; zeros if left out.
+        rest_state: initial values of the m - 3 rows after theta; zeros if left out.
         controls: k, their number.
     """
 
@@ -118,8 +122,8 @@ class FunctionDynamics(AbstractUserDynamics):
         array = dr.is_array_v(value) and not dr.is_tensor_v(value)
         if not (array and dr.depth_v(value) == 2 or isinstance(value, list | tuple)):
             shape = getattr(value, "shape", None)
-            found = type(value).__name__ + (f" of shape {shape}" if shape else "")
-            raise InputError(self._expected(found))
+            description = type(value).__name__ + (f" of shape {shape}" if shape else "")
+            raise InputError(self._expected(description))
         if len(value) != self.size:
             raise InputError(self._expected(f"{len(value)} rows"))
         try:
@@ -132,10 +136,10 @@ class FunctionDynamics(AbstractUserDynamics):
             raise InputError(self._expected(f"rows of {widths} entries"))
         return kind(*rows)
 
-    def _expected(self, found: str) -> str:
+    def _expected(self, description: str) -> str:
         return (
-            f"{self.name}: returned {found}; {self.size} rows are needed, one number "
-            "for each vehicle"
+            f"{self.name}: returned {description}; {self.size} rows are needed, one "
+            "number for each vehicle"
         )
 
 
@@ -168,10 +172,12 @@ def call_model(
         ) from err
 
 
-def append_rows(poses: np.ndarray, rest: tuple[float, ...]) -> np.ndarray:
-    """Append the same values to every pose: (n, 3) to (n, 3 + len(rest))."""
+def append_rows(poses: np.ndarray, rest_state: tuple[float, ...]) -> np.ndarray:
+    """Append the same values to every pose: (n, 3) to (n, 3 + len(rest_state))."""
     poses = np.atleast_2d(np.asarray(poses, np.float64))
-    return np.hstack([poses, np.broadcast_to(rest, (len(poses), len(rest)))])
+    return np.hstack(
+        [poses, np.broadcast_to(rest_state, (len(poses), len(rest_state)))]
+    )
 
 
 def require_finite(owner: str, values: np.ndarray) -> None:

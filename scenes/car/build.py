@@ -111,7 +111,7 @@ def _wheel(x: float, side: int) -> list[Part]:
 
 def _details() -> list[Part]:
     """Return bumpers, lamps, grille, number plates, mirrors, handles and seams."""
-    parts = [
+    details = [
         box((2.03, 0, 0.37), (0.13, 1.42, 0.13), _TRIM),
         box((-2.03, 0, 0.39), (0.13, 1.54, 0.15), _TRIM),
         box((2.05, 0, 0.51), (0.09, 0.74, 0.08), _TRIM),
@@ -119,7 +119,7 @@ def _details() -> list[Part]:
         box((-2.085, 0, 0.60), (0.03, 0.46, 0.11), _WHITE),
     ]
     for side in (-1, 1):
-        parts += [
+        details += [
             box((2.00, 0.56 * side, 0.585), (0.14, 0.26, 0.11), _LAMP),
             box((1.94, 0.73 * side, 0.58), (0.14, 0.10, 0.09), _AMBER),
             box((-2.05, 0.60 * side, 0.77), (0.10, 0.24, 0.13), _TAIL),
@@ -127,13 +127,13 @@ def _details() -> list[Part]:
             box((0.62, 0.85 * side, 1.00), (0.12, 0.10, 0.12), _PAINT),
         ]
         for x in (0.60, -0.32, -1.02):
-            parts.append(box((x, 0.885 * side, 0.56), (0.03, 0.03, 0.40), _TRIM))
+            details.append(box((x, 0.885 * side, 0.56), (0.03, 0.03, 0.40), _TRIM))
         for x in (-0.12, -0.86):
-            parts.append(box((x, 0.885 * side, 0.72), (0.16, 0.035, 0.04), _ALLOY))
-    return parts
+            details.append(box((x, 0.885 * side, 0.72), (0.16, 0.035, 0.04), _ALLOY))
+    return details
 
 
-def parts() -> list[Part]:
+def coloured_meshes() -> list[Part]:
     """Return closed meshes with their colours, metres, z up, front towards +x."""
     wheels = [part for x in _AXLES for side in (-1, 1) for part in _wheel(x, side)]
     return [_body(), _cabin(), *wheels, *_details()]
@@ -141,7 +141,7 @@ def parts() -> list[Part]:
 
 def world_mesh() -> trimesh.Trimesh:
     """Return all parts as one mesh with colours per vertex, metres, z up."""
-    return merged(parts())
+    return merged(coloured_meshes())
 
 
 def build(path: Path) -> None:

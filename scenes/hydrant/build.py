@@ -45,7 +45,7 @@ def _bonnet(low: float, radius: float, rise: float) -> Part:
     return trimesh.creation.revolve(profile, sections=32), _WHITE
 
 
-def parts() -> list[Part]:
+def coloured_meshes() -> list[Part]:
     """Return closed meshes with their colours, metres, z up, foot at the origin."""
     result = [
         cylinder(0.165, 0.0, 0.035, _GREY),
@@ -70,7 +70,7 @@ def parts() -> list[Part]:
 
 def world_mesh() -> trimesh.Trimesh:
     """Return all parts as one mesh with colours per vertex, metres, z up."""
-    return merged(parts())
+    return merged(coloured_meshes())
 
 
 def build(path: Path) -> None:

@@ -109,8 +109,8 @@ def test_the_curve_counts_drives_and_passes_back(loop):
 
 
 def test_the_curve_keeps_the_first_of_the_best():
-    found = best_so_far([2, 4, 6, 8], [-1.0, 3.0, -1.0, -2.0], [0.1, 0.4, 0.3, 0.2])
-    assert found.tolist() == [
+    curve = best_so_far([2, 4, 6, 8], [-1.0, 3.0, -1.0, -2.0], [0.1, 0.4, 0.3, 0.2])
+    assert curve.tolist() == [
         [2, -1.0, 0.1],
         [4, -1.0, 0.1],
         [6, -1.0, 0.1],
@@ -122,11 +122,11 @@ def test_what_has_no_gradient_is_told(loop):
     """By a policy that looks at nothing, also after the attack was resumed."""
     blind = toy.SmoothPolicy()
     blind.weight.data.zero_()
-    more = {"horizon": 3, "freedom": Freedom(0.3, 0.02)}
+    options = {"horizon": 3, "freedom": Freedom(0.3, 0.02)}
     for policy, expected in ((None, []), (TorchPolicy(blind), [0])):
-        with attack_of(loop, "absolute", policy=policy, **more) as attack:
+        with attack_of(loop, "absolute", policy=policy, **options) as attack:
             assert attack.without_gradient == []  # nothing is known yet
             attack.step()
-            with attack_of(loop, "absolute", policy=policy, **more) as again:
+            with attack_of(loop, "absolute", policy=policy, **options) as again:
                 again.load_tensors(attack.tensors())
         assert attack.without_gradient == again.without_gradient == expected

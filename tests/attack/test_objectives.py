@@ -173,7 +173,7 @@ def test_derivatives(name, count, horizon, size, rng):
     objective, expected = CASES[name]
     states = drives(rng, count, horizon, size)
     cotangent = rng.uniform(0.5, 1.5, count)
-    found = gradient(objective, states, cotangent)
+    derivative = gradient(objective, states, cotangent)
     direction = rng.normal(size=states.shape)
 
     def along(step):
@@ -181,7 +181,7 @@ def test_derivatives(name, count, horizon, size, rng):
 
     coarse = (along(1e-4) - along(-1e-4)) / 2e-4
     fine = (along(5e-5) - along(-5e-5)) / 1e-4
-    product = (found * direction).sum()
+    product = (derivative * direction).sum()
     assert product == pytest.approx((4 * fine - coarse) / 3, rel=1e-7)
     pushed = (cotangent * tangent(objective, states, direction)).sum()
     assert pushed == pytest.approx(product, rel=1e-12)
@@ -195,11 +195,11 @@ def test_lane_centre(name):
     np.testing.assert_allclose(
         evaluate(objective, states), expected(states), rtol=1e-9, atol=1e-14
     )
-    found = gradient(objective, states, [1.0])
+    derivative = gradient(objective, states, [1.0])
     if name == "target":
-        assert np.abs(found[0, :, 1]).max() > 0.5
+        assert np.abs(derivative[0, :, 1]).max() > 0.5
     else:
-        np.testing.assert_allclose(found, 0, atol=1e-12)
+        np.testing.assert_allclose(derivative, 0, atol=1e-12)
 
 
 def test_medial_axis():
@@ -208,8 +208,8 @@ def test_medial_axis():
     states = np.array([[[9.0, 1.0, 0.0], [8.5, 1.5, 0.0]]])
     objective = StageSum(AbsoluteDeviation(bend))
     assert evaluate(objective, states)[0] == pytest.approx(-2.5, abs=1e-15)
-    for found in gradient(objective, states, [1.0])[0]:
-        assert found.tolist() in ([0, -1, 0], [1, 0, 0])
+    for derivative in gradient(objective, states, [1.0])[0]:
+        assert derivative.tolist() in ([0, -1, 0], [1, 0, 0])
 
 
 def test_heading_against_the_lane():
@@ -218,9 +218,9 @@ def test_heading_against_the_lane():
     states = np.array([[[5.0, 0.3, np.pi]], [[5.0, 0.3, -np.pi]]])
     value = evaluate(objective, states)
     np.testing.assert_allclose(value, -rounded(np.pi, 0.02), rtol=1e-12)
-    found = gradient(objective, states, [1.0, 1.0])
-    np.testing.assert_allclose(np.abs(found[..., 2]), 1, rtol=1e-4)
-    assert not found[..., :2].any()
+    derivative = gradient(objective, states, [1.0, 1.0])
+    np.testing.assert_allclose(np.abs(derivative[..., 2]), 1, rtol=1e-4)
+    assert not derivative[..., :2].any()
 
 
 @pytest.mark.parametrize("first", [1, 2, 4, 6, None])
@@ -232,10 +232,10 @@ def test_departure_time_becomes_exact(first):
     states = ROUTE.pose_at(np.linspace(0, 5, 6), lateral)[None]
     exact = DT * (6 if first is None else first - 1)
     for softness in (0.1, 0.05, 0.02, 1e-3):
-        found = evaluate(DepartureTime(ROUTE, LIMIT, softness), states)[0]
+        departure = evaluate(DepartureTime(ROUTE, LIMIT, softness), states)[0]
         # the margin is 0.35 m on both sides; a period's chance is off by less
         bound = DT * 6 * 6 * np.exp(-0.35 / softness)
-        assert abs(found - exact) <= bound + 1e-15
+        assert abs(departure - exact) <= bound + 1e-15
 
 
 def test_departure_time_far_out_is_finite():
@@ -247,9 +247,9 @@ def test_departure_time_far_out_is_finite():
 
 def test_history_of_time(rng):
     states = drives(rng, 2, 3)
-    found = history(states)
-    np.testing.assert_allclose(found.time.numpy(), [0.1, 0.2, 0.3] * 2, rtol=1e-15)
-    np.testing.assert_array_equal(found.final.numpy().T, states[:, -1])
+    recorded = history(states)
+    np.testing.assert_allclose(recorded.time.numpy(), [0.1, 0.2, 0.3] * 2, rtol=1e-15)
+    np.testing.assert_array_equal(recorded.final.numpy().T, states[:, -1])
 
 
 def test_no_kernel_is_compiled_twice(rng):
@@ -280,8 +280,8 @@ def test_weights(rng):
     assert Listed((0.0, -1.5)).of(2, 0.1).tolist() == [0, -1.5]
     assert End().of(3, 0.1).tolist() == [0, 0, 1]
     states, weights = drives(rng, 3, 5), rng.normal(size=5)
-    found = evaluate(StageSum(AbsoluteDeviation(ROUTE), weights), states)
-    np.testing.assert_allclose(found, -(weights * cross_track(states)[0]).sum(1))
+    costs = evaluate(StageSum(AbsoluteDeviation(ROUTE), weights), states)
+    np.testing.assert_allclose(costs, -(weights * cross_track(states)[0]).sum(1))
 
 
 test_unusable_values_are_named = refusals(
@@ -326,39 +326,41 @@ def cvar(costs, fraction):
 @pytest.mark.parametrize("count", [1, 4, 9])
 def test_cvar(fraction, count, rng):
     costs = rng.normal(size=count)
-    value, found = reduce(CVaR(fraction), costs)
+    value, derivative = reduce(CVaR(fraction), costs)
     assert value == pytest.approx(cvar(costs, fraction), rel=1e-12)
     direction = rng.normal(size=count)
     up, down = (cvar(costs + s * 1e-6 * direction, fraction) for s in (1, -1))
-    assert found @ direction == pytest.approx((up - down) / 2e-6, rel=1e-7, abs=1e-9)
-    assert found.sum() == pytest.approx(1, rel=1e-12)
+    assert derivative @ direction == pytest.approx(
+        (up - down) / 2e-6, rel=1e-7, abs=1e-9
+    )
+    assert derivative.sum() == pytest.approx(1, rel=1e-12)
 
 
 def test_mean_and_worst(rng):
     costs = rng.normal(size=5)
-    value, found = reduce(Worst(), costs)
+    value, derivative = reduce(Worst(), costs)
     assert value == pytest.approx(costs.max(), rel=1e-15)
-    assert found.tolist() == (costs == costs.max()).astype(float).tolist()
-    value, found = reduce(Mean(), costs)
+    assert derivative.tolist() == (costs == costs.max()).astype(float).tolist()
+    value, derivative = reduce(Mean(), costs)
     assert value == pytest.approx(costs.mean(), rel=1e-14)
-    np.testing.assert_allclose(found, 0.2)
+    np.testing.assert_allclose(derivative, 0.2)
 
 
 @pytest.mark.parametrize("reduction", [Mean(), CVaR(0.3), CVaR(0.05), Worst()])
 def test_equal_costs_share_the_derivative(reduction):
-    value, found = reduce(reduction, [-2.0] * 4)
+    value, derivative = reduce(reduction, [-2.0] * 4)
     assert value == pytest.approx(-2, rel=1e-15)
-    np.testing.assert_allclose(found, 0.25, rtol=1e-15)
-    value, found = reduce(reduction, [-2.0])
-    assert value == -2 and found.tolist() == [1]
+    np.testing.assert_allclose(derivative, 0.25, rtol=1e-15)
+    value, derivative = reduce(reduction, [-2.0])
+    assert value == -2 and derivative.tolist() == [1]
 
 
 def test_ties_at_the_quantile_share_the_rest():
-    value, found = reduce(CVaR(0.5), [3.0, 1.0, 1.0, 0.0])
+    value, derivative = reduce(CVaR(0.5), [3.0, 1.0, 1.0, 0.0])
     assert value == pytest.approx(2.0)
-    np.testing.assert_allclose(found, [0.5, 0.25, 0.25, 0])
-    _, found = reduce(Worst(), [1.0, 3.0, 3.0])
-    np.testing.assert_allclose(found, [0, 0.5, 0.5])
+    np.testing.assert_allclose(derivative, [0.5, 0.25, 0.25, 0])
+    _, derivative = reduce(Worst(), [1.0, 3.0, 3.0])
+    np.testing.assert_allclose(derivative, [0, 0.5, 0.5])
 
 
 def test_reductions_hide_no_nan():

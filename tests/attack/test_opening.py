@@ -30,7 +30,7 @@ OPENED = Plan(Schedule(38, 0.1), Sides(5, toy.ROUTE))
 
 
 @pytest.fixture
-def parts():
+def problem():
     loop, field = toy.make_loop()
     initial = loop.initial(np.array([[0.0, 0.1, 0.0]]))
     cost = StageSum(CrossTrackDeviation(toy.ROUTE))
@@ -38,8 +38,8 @@ def parts():
     return rollout, initial, field
 
 
-def attack_of(parts, plan):
-    rollout, initial, _ = parts
+def attack_of(problem, plan):
+    rollout, initial, _ = problem
     return GradientAttack(rollout, toy.ROUTE, initial, Freedom(0.1), plan)
 
 
@@ -53,10 +53,10 @@ def mean_signed(attack):
     return float(toy.ROUTE.cross_track_numpy(states[0, 1:]).mean())
 
 
-def test_each_try_goes_to_its_side_and_the_best_goes_on(parts):
-    attack = attack_of(parts, Plan(Schedule(3), SIDES))
+def test_each_try_goes_to_its_side_and_the_best_goes_on(problem):
+    attack = attack_of(problem, Plan(Schedule(3), SIDES))
     attack._install()
-    original, before = toy.texture_of(parts[2]), mean_signed(attack)
+    original, before = toy.texture_of(problem[2]), mean_signed(attack)
     sides = []
     for number in range(2):
         attack.step()
@@ -80,45 +80,45 @@ def test_each_try_goes_to_its_side_and_the_best_goes_on(parts):
     assert attack.is_over and attack.iteration == 7
 
 
-def test_an_interrupted_opening_goes_on_as_if_it_had_not_been(parts):
+def test_an_interrupted_opening_goes_on_as_if_it_had_not_been(problem):
     plan = Plan(Schedule(3), SIDES)
-    attack = attack_of(parts, plan)
+    attack = attack_of(problem, plan)
     for _ in range(3):
         attack.step()
-    kept = attack.tensors()
+    checkpoint = attack.tensors()
     for _ in range(3):
         attack.step()
     expected = attack.tensors()
-    parts[2].set_parameter("texture", attack._colourings["0"]._original)
-    again = attack_of(parts, plan)
-    again.load_tensors(kept)
+    problem[2].set_parameter("texture", attack._colourings["0"]._original)
+    again = attack_of(problem, plan)
+    again.load_tensors(checkpoint)
     for _ in range(3):
         again.step()
-    found = again.tensors()
-    assert found.keys() == expected.keys()
+    tensors = again.tensors()
+    assert tensors.keys() == expected.keys()
     for key, value in expected.items():
-        np.testing.assert_allclose(found[key], value, atol=1e-6, err_msg=key)
+        np.testing.assert_allclose(tensors[key], value, atol=1e-6, err_msg=key)
 
 
-def test_restarts_begin_with_the_original_and_then_with_random_looks(parts):
-    field = parts[2]
+def test_restarts_begin_with_the_original_and_then_with_random_looks(problem):
+    field = problem[2]
     original = toy.texture_of(field)
     looks = RandomLooks([field], Freedom(0.1), "blobs", 5)
-    attack = attack_of(parts, Plan(Schedule(2), Restarts(2, looks)))
-    seen = []
+    attack = attack_of(problem, Plan(Schedule(2), Restarts(2, looks)))
+    textures = []
     for _ in range(3):
         attack._begin()
-        seen.append(texture_now(attack))
+        textures.append(texture_now(attack))
         attack.step()
         attack.step()
-    np.testing.assert_allclose(seen[0], original, atol=1e-5)
+    np.testing.assert_allclose(textures[0], original, atol=1e-5)
     colours = Colours(field)
     for number in (1, 2):
         expected = colours.near(looks.textures(number - 1)[0])
-        assert np.abs(seen[number] - original).max() > 0.1
-        shown = seen[number]
+        assert np.abs(textures[number] - original).max() > 0.1
+        shown = textures[number]
         np.testing.assert_allclose(colours.near(shown), expected, atol=1e-3)
-    assert np.abs(seen[1] - seen[2]).max() > 0.1
+    assert np.abs(textures[1] - textures[2]).max() > 0.1
     best = min(record.objective for record in attack.history)
     assert attack.step().objective == pytest.approx(best, abs=1e-6)
 
@@ -128,16 +128,16 @@ def test_a_try_of_one_iteration_is_refused():
         Sides(1, toy.ROUTE)
 
 
-def test_colours_near_a_texture_look_like_it(parts):
-    field = parts[2]
+def test_colours_near_a_texture_look_like_it(problem):
+    field = problem[2]
     before = toy.texture_of(field)
     colours = Colours(field)
     np.testing.assert_allclose(colours.near(before), colours.start, atol=1e-5)
-    wanted = np.random.default_rng(1).uniform(0.1, 0.9, colours.start.shape)
-    again = colours.near(colours.texture(wanted.astype(np.float32)))
+    expected = np.random.default_rng(1).uniform(0.1, 0.9, colours.start.shape)
+    again = colours.near(colours.texture(expected.astype(np.float32)))
     cubes = [
         value.reshape((colours.level.resolution,) * 3 + (3,))
-        for value in (again, wanted)
+        for value in (again, expected)
     ]
     inside = [cube[:-1, :-1, :-1] for cube in cubes]  # the last vertices lie beyond
     np.testing.assert_allclose(*inside, atol=1e-4)
@@ -148,8 +148,8 @@ def test_colours_near_a_texture_look_like_it(parts):
     ("opening", "count", "tried"),
     [("none", 8, 0), ("sides", 17, 4), ("restarts", 24, 6)],
 )
-def test_tries_are_part_of_the_iterations(parts, opening, count, tried):
-    rollout, initial, _ = parts
+def test_tries_are_part_of_the_iterations(problem, opening, count, tried):
+    rollout, initial, _ = problem
     task = Task(rollout, toy.ROUTE, initial, Freedom(0.1), 3)
     method = GradientMethod(opening=opening, max_iterations=count)
     plan = method.build(task).plan
@@ -165,12 +165,12 @@ def test_tries_are_part_of_the_iterations(parts, opening, count, tried):
         ("in_turns", [False] * 4 + [False, True] * 3),
     ],
 )
-def test_when_the_gradient_follows_the_camera(parts, follow, expected):
+def test_when_the_gradient_follows_the_camera(problem, follow, expected):
     plan = Plan(Schedule(6), SIDES, follow)
     falling = [-float(k) for k in range(10)]
-    found = [plan.followed(parts[0], falling[:k]).attached for k in range(10)]
-    assert found == expected
-    detached = replace(parts[0], attached=False)
+    attached = [plan.followed(problem[0], falling[:k]).attached for k in range(10)]
+    assert attached == expected
+    detached = replace(problem[0], attached=False)
     assert not any(plan.followed(detached, falling[:k]).attached for k in range(10))
 
 
@@ -194,10 +194,10 @@ def test_a_part_that_gains_nothing_more_has_converged(plan):
     assert plan.steady(objectives)[-1] == range(10, 18)
 
 
-def test_its_moments_are_forgotten(parts):
+def test_its_moments_are_forgotten(problem):
     """An attached step, after detached ones, is as large as a first one."""
     plan = Plan(Schedule(4), follow="second_half")
-    attack = attack_of(parts, plan)
+    attack = attack_of(problem, plan)
     steps = []
     for _ in range(3):
         before = attack._value("0")
@@ -207,16 +207,16 @@ def test_its_moments_are_forgotten(parts):
     assert steps[2] == pytest.approx(steps[0], rel=1e-3)
 
 
-def test_what_mattered_in_a_try_is_not_forgotten(parts):
-    attack = attack_of(parts, Plan(Schedule(3), SIDES))
+def test_what_mattered_in_a_try_is_not_forgotten(problem):
+    attack = attack_of(problem, Plan(Schedule(3), SIDES))
     attack.step()
     attack.step()
-    kept = attack.tensors()
+    checkpoint = attack.tensors()
     assert attack.without_gradient == []
     attack._begin()  # of the second try
     assert attack.without_gradient == []
-    again = attack_of(parts, Plan(Schedule(3), SIDES))
-    again.load_tensors(kept | {"depended": np.zeros(1, np.uint8)})
+    again = attack_of(problem, Plan(Schedule(3), SIDES))
+    again.load_tensors(checkpoint | {"depended": np.zeros(1, np.uint8)})
     assert again.without_gradient == [0]
 
 

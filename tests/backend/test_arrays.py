@@ -36,15 +36,15 @@ def _rays(rng: np.random.Generator, count: int) -> Rays:
 
 def test_dataclasses_are_laid_leaf_by_leaf_and_single_entries_spread(rng):
     counts = [5, 1, 7]
-    parts = [_rays(rng, count) for count in counts]
-    parts[2].jitter = dr.opaque(mi.Float, 0.25)
-    found = concat(parts, counts)
-    expected = np.concatenate([part.origin.numpy() for part in parts], axis=1)
-    assert (found.origin.numpy() == expected).all()
-    assert found.gains[0].colour.numpy().shape == (3, 13)
-    assert found.jitter.numpy().tolist() == [0.5] * 6 + [0.25] * 7
-    assert np.isinf(found.t_max.numpy()).sum() == 13
-    assert found.active.numpy().tolist() == [True] * 13
+    chunks = [_rays(rng, count) for count in counts]
+    chunks[2].jitter = dr.opaque(mi.Float, 0.25)
+    rays = concat(chunks, counts)
+    expected = np.concatenate([chunk.origin.numpy() for chunk in chunks], axis=1)
+    assert (rays.origin.numpy() == expected).all()
+    assert rays.gains[0].colour.numpy().shape == (3, 13)
+    assert rays.jitter.numpy().tolist() == [0.5] * 6 + [0.25] * 7
+    assert np.isinf(rays.t_max.numpy()).sum() == 13
+    assert rays.active.numpy().tolist() == [True] * 13
 
 
 def test_kernels_do_not_depend_on_sizes_and_numbers_of_parts(rng):
@@ -52,12 +52,12 @@ def test_kernels_do_not_depend_on_sizes_and_numbers_of_parts(rng):
     split(dr.arange(mi.Float, 8) + 0.5, 4)
     dr.eval(rows := dr.arange(mi.Float, 12) + 0.5)
     for counts in ((6, 6, 6), (4, 9), (3, 3, 3, 3), (8,)):
-        parts = [_rays(rng, count) for count in counts]
+        chunks = [_rays(rng, count) for count in counts]
         with nothing_compiled():
-            concat(parts, counts)
+            concat(chunks, counts)
     with nothing_compiled():
-        parts = split(rows, 3)
-    assert [part.numpy().tolist() for part in parts[:2]] == [
+        chunks = split(rows, 3)
+    assert [chunk.numpy().tolist() for chunk in chunks[:2]] == [
         [0.5, 1.5, 2.5],
         [3.5, 4.5, 5.5],
     ]
@@ -88,18 +88,18 @@ def steps(optimiser: Adam, first: int, last: int) -> None:
 
 
 def test_loaded_state_goes_on_as_the_whole_run():
-    whole, half, resumed = start(), start(), start()
-    steps(whole, 0, 5)
+    uninterrupted, half, resumed = start(), start(), start()
+    steps(uninterrupted, 0, 5)
     steps(half, 0, 3)
     load_adam(resumed, adam_tensors(half))
     steps(resumed, 3, 5)
-    expected = adam_tensors(whole)
+    expected = adam_tensors(uninterrupted)
     assert {int(expected[f"time.{name}"][0]) for name in NAMES} == {5}
     for name, value in adam_tensors(resumed).items():
         np.testing.assert_array_equal(value, expected[name], name)
     for name in NAMES:
-        assert type(resumed[name]) is type(whole[name])
-        assert resumed.learning_rate(name) == whole.learning_rate(name)
+        assert type(resumed[name]) is type(uninterrupted[name])
+        assert resumed.learning_rate(name) == uninterrupted.learning_rate(name)
 
 
 def test_arrays_are_copies_and_may_be_loaded_for_some_parameters():
@@ -155,8 +155,8 @@ def test_what_the_caller_does_with_gradients_does_not_matter():
     x = mi.Float(1, 2)
     dr.enable_grad(x)
     with dr.suspend_grad():
-        found = vjp(lambda x: x * x, x, 3.0)
-    np.testing.assert_array_equal(found, [6, 12])
+        gradient = vjp(lambda x: x * x, x, 3.0)
+    np.testing.assert_array_equal(gradient, [6, 12])
     np.testing.assert_array_equal(dr.grad(x), 0)
 
 

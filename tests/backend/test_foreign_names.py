@@ -59,9 +59,9 @@ def dotted(node: ast.AST) -> list[str]:
 def foreign() -> Iterator[tuple[str, list[str]]]:
     """Yield where a name of Dr.Jit or Mitsuba stands, and its parts."""
     for path, node in nodes():
-        parts = dotted(node) if isinstance(node, ast.Attribute) else []
-        if parts and parts[0] in ROOTS:
-            yield f"{path}:{node.lineno}", parts
+        identifiers = dotted(node) if isinstance(node, ast.Attribute) else []
+        if identifiers and identifiers[0] in ROOTS:
+            yield f"{path}:{node.lineno}", identifiers
 
 
 def test_private_names_of_others():
@@ -80,7 +80,10 @@ def test_private_names_of_others():
 
 def test_modules_of_details():
     roots = {name: module.__name__ for name, module in ROOTS.items()}
-    used = {".".join([roots[parts[0]], *parts[1:]]) for _, parts in foreign()}
+    used = {
+        ".".join([roots[identifiers[0]], *identifiers[1:]])
+        for _, identifiers in foreign()
+    }
     assert {name for name in used if ".detail." in name} == DETAIL
 
 
@@ -92,9 +95,9 @@ def test_private_names_and_fields_are_there():
 @pytest.mark.usefixtures("spectral")  # it has what RGB has
 def test_every_name_is_there():
     missing = set()
-    for place, (root, *rest) in foreign():
+    for place, (root, *attributes) in foreign():
         try:
-            reduce(getattr, rest, ROOTS[root])
+            reduce(getattr, attributes, ROOTS[root])
         except AttributeError as error:
             missing.add(f"{place}: {error}")
     assert not missing, "\n".join(sorted(missing))

@@ -30,10 +30,12 @@ needs_package = pytest.mark.skipif(
 def run_python(code: str, **variables: str) -> list[str]:
     """Run code in a process without LLVM or variant settings of this one."""
     ours = (llvm.VARIABLE, variant.VARIABLE)
-    kept = {name: value for name, value in os.environ.items() if name not in ours}
+    environment = {
+        name: value for name, value in os.environ.items() if name not in ours
+    }
     done = subprocess.run(
         [sys.executable, "-c", code],
-        env=kept | variables,
+        env=environment | variables,
         capture_output=True,
         text=True,
         timeout=120,
@@ -50,12 +52,16 @@ def without_variable(monkeypatch):
 
 @needs_package
 def test_package_is_found_and_loaded_in_a_fresh_process():
-    ensured, found, origin, major, *_ = run_python(
+    ensured, active_variant, origin, major, *_ = run_python(
         "import mi_nerfattack, mi_nerfattack.backend.llvm as llvm, mitsuba as mi\n"
         "print(mi_nerfattack.backend.variant.ensure(), mi.variant())\n"
         "print(llvm.locate().origin, *llvm.check_version())"
     )
-    assert (ensured, found, origin) == ("llvm_ad_rgb", "llvm_ad_rgb", "package")
+    assert (ensured, active_variant, origin) == (
+        "llvm_ad_rgb",
+        "llvm_ad_rgb",
+        "package",
+    )
     assert 19 <= int(major) < 24
 
 
@@ -94,12 +100,12 @@ def test_mitsuba_may_be_imported_first(first):
 
 
 def test_the_user_s_variable_stays_when_mitsuba_is_imported_first():
-    told = run_python(
+    words = run_python(
         f"import {HOOK}\nimport drjit, os, sys\n"
         f"print(os.environ['{llvm.VARIABLE}'], 'mi_nerfattack' in sys.modules)",
         **{llvm.VARIABLE: "/nowhere/libLLVM.so"},
     )
-    assert told == ["/nowhere/libLLVM.so", "False"]
+    assert words == ["/nowhere/libLLVM.so", "False"]
 
 
 def test_users_variable_is_kept(monkeypatch):
@@ -109,13 +115,13 @@ def test_users_variable_is_kept(monkeypatch):
 
 
 def test_wrong_variable_is_named_and_not_replaced():
-    told = run_python(
+    words = run_python(
         "import mi_nerfattack\n"
         "try:\n    mi_nerfattack.backend.variant.ensure()\n"
         "except mi_nerfattack.SetupError as err:\n    print(err)",
         **{llvm.VARIABLE: "/nowhere/libLLVM.so"},
     )
-    assert any(word.startswith("/nowhere/libLLVM.so") for word in told)
+    assert any(word.startswith("/nowhere/libLLVM.so") for word in words)
 
 
 def test_variable_is_left_alone_once_drjit_is_loaded(without_variable):
@@ -125,14 +131,14 @@ def test_variable_is_left_alone_once_drjit_is_loaded(without_variable):
 
 
 @pytest.mark.parametrize(
-    ("found", "allowed"), [((-1, -1, -1), "install"), ((16, 0, 0), "LLVM 16.* 17 ")]
+    ("version", "allowed"), [((-1, -1, -1), "install"), ((16, 0, 0), "LLVM 16.* 17 ")]
 )
 def test_missing_and_old_libraries_are_refused(
-    monkeypatch, without_variable, found, allowed
+    monkeypatch, without_variable, version, allowed
 ):
     monkeypatch.setattr(llvm, "_find_in_package", lambda: None)
     monkeypatch.setattr(llvm, "_system_folders", lambda: [])
-    monkeypatch.setattr(dr.detail, "llvm_version", lambda: found)
+    monkeypatch.setattr(dr.detail, "llvm_version", lambda: version)
     with pytest.raises(SetupError, match=allowed):
         llvm.check_version()
     monkeypatch.setattr(dr.detail, "llvm_version", lambda: (17, 0, 0))
@@ -159,10 +165,10 @@ def test_newest_system_library_of_19_or_more_is_taken(
         folders[-1].mkdir(parents=True)
         (folders[-1] / f"libLLVM-{major}.so.1").touch()
         path = newest and tmp_path / f"llvm-{newest}/lib/libLLVM-{newest}.so.1"
-        found = llvm.Library(path, "system" if path else "dr.jit")
-        assert llvm.locate() == found
+        library = llvm.Library(path, "system" if path else "dr.jit")
+        assert llvm.locate() == library
     (tmp_path / "libLLVM.so").symlink_to(folders[-1])  # a folder
-    assert llvm.locate() == found
+    assert llvm.locate() == library
 
 
 @needs_package
@@ -234,8 +240,8 @@ def test_variant_of_the_environment_is_set():
         "import mi_nerfattack, mitsuba as mi\n"
         "print(mi_nerfattack.backend.variant.ensure(), mi.variant())"
     )
-    told = run_python(code, **{variant.VARIABLE: "llvm_ad_mono"})
-    assert told == ["llvm_ad_mono"] * 2
+    words = run_python(code, **{variant.VARIABLE: "llvm_ad_mono"})
+    assert words == ["llvm_ad_mono"] * 2
 
 
 def test_a_set_variant_is_kept(no_variant_left):

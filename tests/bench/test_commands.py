@@ -22,9 +22,9 @@ pytestmark = pytest.mark.usefixtures("variant")
 def test_every_benchmark_starts_and_takes_json_if_it_has_figures(capsys):
     for name, command in COMMANDS.items():
         assert main([name, "--help"]) == 0
-        told = capsys.readouterr().out
-        assert f"python -m bench {name}" in told
-        assert get_type_hints(command.run)["return"] is Result and "--json" in told
+        output = capsys.readouterr().out
+        assert f"python -m bench {name}" in output
+        assert get_type_hints(command.run)["return"] is Result and "--json" in output
     assert main(["render", "--sizes", "200"]) == cli.EXIT_INPUT
     assert "--sizes: '200'" in capsys.readouterr().err
 
@@ -82,9 +82,9 @@ def test_attack_measures_both_sides(run):
     row = document["sizes"]["32x16"]
     for name in attack.TIMES:
         assert row[f"{name}_seconds"] > 0 and row[f"{name}_cpu_seconds"] > 0
-    kept = row["kept_backgrounds_seconds"]
-    assert row["torch_time_ratio"] == row["torch_seconds"] / kept
-    assert row["iteration_over_rollout"] == kept / row["rollout_seconds"]
+    iteration_seconds = row["kept_backgrounds_seconds"]
+    assert row["torch_time_ratio"] == row["torch_seconds"] / iteration_seconds
+    assert row["iteration_over_rollout"] == iteration_seconds / row["rollout_seconds"]
     assert row["kernels_compiled_after_warmup"] == 0
 
 

@@ -39,13 +39,13 @@ def test_steps_that_fail_or_take_too_long_leave_the_others():
         Step("wrong", ("-c", "raise SystemExit(3)"), 60),
         Step("tests", ("-c", TESTS + "; raise SystemExit(1)"), 60),
     )
-    kept: list[str] = []
+    snapshots: list[str] = []
     start = time.monotonic()
-    document = gpu.measure(plan, {"gpu": {}}, lambda d: kept.append(json.dumps(d)))
+    document = gpu.measure(plan, {"gpu": {}}, lambda d: snapshots.append(json.dumps(d)))
     assert time.monotonic() - start < 50  # nothing waits for what sleeps
     steps = document["steps"]
-    assert [len(json.loads(text)["steps"]) for text in kept] == [1, 2, 3, 4]
-    assert json.loads(kept[-1]) == document
+    assert [len(json.loads(text)["steps"]) for text in snapshots] == [1, 2, 3, 4]
+    assert json.loads(snapshots[-1]) == document
     assert steps["done"]["result"][chosen.VARIABLE] == "cuda_ad_rgb"
     assert "0.1 s" in steps["late"]["error"] and " 3" in steps["wrong"]["error"]
     assert steps["tests"]["exit_code"] == 1
@@ -64,27 +64,27 @@ def test_without_a_gpu_it_is_refused(tmp_path, capsys, monkeypatch):
 
 
 def test_the_file_is_written(tmp_path, monkeypatch):
-    about = {"name": "NVIDIA Z100", "memory_mb": 1.0, "torch_cuda": "13.0"}
+    device = {"name": "NVIDIA Z100", "memory_mb": 1.0, "torch_cuda": "13.0"}
     rows = [{"frames": 8, "frames_per_s": 80.0, "drjit_peak_memory_mb": 12.0}]
-    found = {"latency_ms": 2.0, "batches": rows}
-    plan = (Step("frames", ("-c", f"import json; print(json.dumps({found}))"), 60),)
-    monkeypatch.setattr(gpu, "find_gpu", lambda: about)
+    figures = {"latency_ms": 2.0, "batches": rows}
+    plan = (Step("frames", ("-c", f"import json; print(json.dumps({figures}))"), 60),)
+    monkeypatch.setattr(gpu, "find_gpu", lambda: device)
     monkeypatch.setattr(gpu, "PLAN", plan)
     assert main(["gpu", "-o", str(tmp_path)]) == 0
     (path,) = tmp_path.iterdir()
     assert path.name.endswith("-nvidia-z100-gpu.json")
     document = json.loads(path.read_text())
-    assert document["gpu"] == about and document["variant"] == "cuda_ad_rgb"
-    assert document["steps"]["frames"]["result"] == found
+    assert document["gpu"] == device and document["variant"] == "cuda_ad_rgb"
+    assert document["steps"]["frames"]["result"] == figures
 
 
 @pytest.mark.slow
 def test_frames_are_counted(variant, capsys):
     words = ["frames", "--size", "32x16", "--batches", "1", "4", "--repeats", "2"]
     assert main([*words, "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["latency_ms"] > 0 and told["variant"] == variant
-    assert [row["frames"] for row in told["batches"]] == [1, 4]
-    one, four = told["batches"]
+    document = json.loads(capsys.readouterr().out)
+    assert document["latency_ms"] > 0 and document["variant"] == variant
+    assert [row["frames"] for row in document["batches"]] == [1, 4]
+    one, four = document["batches"]
     assert four["frames_per_s"] == pytest.approx(4e3 / four["batch_ms"])
     assert four["drjit_peak_memory_mb"] > one["drjit_peak_memory_mb"]

@@ -18,13 +18,13 @@ FRAMES, SIZE = 3, (24, 12)
 
 
 def test_both_ways_and_both_policies_give_one_gradient():
-    found = []
+    runs = []
     for policy in bench.POLICIES:
         for way in (RolloutLoop("replay", policy, *SIZE), PlainLoop(policy, *SIZE)):
             loss = way.gradient(FRAMES)["loss"]
-            found.append((loss, way.by_colour().astype(np.float64)))
-    assert np.abs(found[0][1]).max() > 0
-    for (loss, gradient), (other, expected) in itertools.combinations(found, 2):
+            runs.append((loss, way.by_colour().astype(np.float64)))
+    assert np.abs(runs[0][1]).max() > 0
+    for (loss, gradient), (other, expected) in itertools.combinations(runs, 2):
         assert loss == pytest.approx(other, rel=1e-6)
         difference = np.abs(gradient - expected).sum() / np.abs(expected).sum()
         assert difference < bench.AGREED

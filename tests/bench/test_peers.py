@@ -24,7 +24,7 @@ from mi_nerfattack.policy.preprocess import Crop, Preprocess, Resize
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.render.composite import Seen
+from mi_nerfattack.render.composite import Marches
 from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
@@ -56,8 +56,8 @@ def one_thread():
     torch.set_num_threads(before)
 
 
-def relative(found: np.ndarray, expected: np.ndarray) -> float:
-    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+def relative(actual: np.ndarray, expected: np.ndarray) -> float:
+    return float(np.linalg.norm(actual - expected) / np.linalg.norm(expected))
 
 
 # The image
@@ -84,18 +84,18 @@ def fan(rng: np.random.Generator, count: int = 64) -> tuple[np.ndarray, np.ndarr
 
 def our_image(field, origin, direction):
     rays = Rays(mi.Point3f(origin.T.copy()), mi.Vector3f(direction.T.copy()))
-    seen = InterleavedComposite().render([PosedField(field)], rays, STOP)
+    marches = InterleavedComposite().render([PosedField(field)], rays, STOP)
     behind = field.background(rays.direction)
-    return (seen.total.radiance + (1 - seen.total.opacity) * behind).numpy().T
+    return (marches.total.radiance + (1 - marches.total.opacity) * behind).numpy().T
 
 
 def test_the_peer_sees_the_same_image(rng, data):
     origin, direction = fan(rng)
     image = our_image(data.field(), origin, direction)
     peer = TorchNGP(data, STOP)
-    found = peer.render(torch.tensor(origin), torch.tensor(direction)).numpy()
+    peer_image = peer.render(torch.tensor(origin), torch.tensor(direction)).numpy()
     assert image.std() > 0.05
-    assert np.abs(found - image).max() < 1e-3
+    assert np.abs(peer_image - image).max() < 1e-3
 
 
 # The fit
@@ -135,17 +135,17 @@ def test_the_peer_has_the_gradients_of_our_renderer(rng, data, pictures):
         mi.Float(jitter.numpy().copy()),
     )
     posed, composite = [PosedField(field)], InterleavedComposite()
-    seen = composite.render(posed, rays, STOP)
-    radiance = mi.Color3f(seen.total.radiance)
-    opacity = mi.Float(seen.total.opacity)
+    marches = composite.render(posed, rays, STOP)
+    radiance = mi.Color3f(marches.total.radiance)
+    opacity = mi.Float(marches.total.opacity)
     dr.enable_grad(radiance, opacity)
     image = radiance + (1 - opacity) * field.background(rays.direction)
-    wanted = mi.Color3f(pictures.colour.reshape(-1, 3).T.astype(np.float32) / 255)
-    error = dr.linear_to_srgb(image * BELOW_WHITE) - wanted
+    target = mi.Color3f(pictures.colour.reshape(-1, 3).T.astype(np.float32) / 255)
+    error = dr.linear_to_srgb(image * BELOW_WHITE) - target
     objective = dr.mean(sum(huber(channel, 0.1) for channel in error)) / 3
     dr.backward(objective)
     total = March(dr.grad(radiance), dr.grad(opacity), dr.zeros(mi.Float, len(index)))
-    composite.backward(posed, rays, seen, Seen(total), STOP)
+    composite.backward(posed, rays, marches, Marches(total), STOP)
 
     assert loss == pytest.approx(float(objective[0]), rel=1e-3)
     ours = {name: dr.grad(field.parameters()[name]).numpy() for name in names}
@@ -153,13 +153,15 @@ def test_the_peer_has_the_gradients_of_our_renderer(rng, data, pictures):
     assert relative(theirs, ours["table"]) < 1e-2
     assert relative(fit.model.sky.grad.numpy().ravel(), ours["sky"]) < 1e-2
     for net in ("density", "colour"):
-        parts = [
+        gradients = [
             value.grad.numpy().ravel()
             for key, value in fit.model.parameters.items()
             if key.startswith(net)
         ]
         packed = np.linalg.norm(ours[f"{net}_weights"])
-        assert np.linalg.norm(np.concatenate(parts)) == pytest.approx(packed, rel=1e-2)
+        assert np.linalg.norm(np.concatenate(gradients)) == pytest.approx(
+            packed, rel=1e-2
+        )
 
 
 def test_gradients_do_not_depend_on_the_chunk(rng, data, pictures):
@@ -171,8 +173,8 @@ def test_gradients_do_not_depend_on_the_chunk(rng, data, pictures):
         results.append((loss, [leaf.grad.clone() for leaf in fit.leaves]))
     (loss, gradients), (other, expected) = results
     assert loss == pytest.approx(other, rel=1e-4)
-    for found, one in zip(gradients, expected, strict=True):
-        assert (found - one).norm() < 1e-3 * one.norm()
+    for gradient, one in zip(gradients, expected, strict=True):
+        assert (gradient - one).norm() < 1e-3 * one.norm()
 
 
 # The closed loop
@@ -201,10 +203,10 @@ def scene() -> NGPData:
 
 
 def peer(scene: NGPData, item: ObjectData):
-    seen = TorchObject(item, STOP)
-    seen.texture.requires_grad_(True)
+    torch_object = TorchObject(item, STOP)
+    torch_object.texture.requires_grad_(True)
     ngp = TorchNGP(scene, STOP)
-    view = TorchView(ngp, seen, TorchCamera(CAMERA, MOUNT), 100)
+    view = TorchView(ngp, torch_object, TorchCamera(CAMERA, MOUNT), 100)
     vehicle, route = TorchVehicle(5.0, 1.5, 0.1), TorchRoute(ROUTE.points, 0.05)
     return TorchLoop(view, Gain(), STAGES, 0, vehicle, route)
 
@@ -226,6 +228,6 @@ def test_the_peer_drives_and_differentiates_as_we_do(rng, scene):
     assert np.ptp(ours[-1, :, 2] - INITIAL[:, 2]) > 1e-3  # the images do steer
     assert np.abs(states.detach().numpy() - ours).max() < 1e-3
     assert cost.item() == pytest.approx(evaluation.value, abs=1e-3)
-    found = other.view.item.texture.grad.numpy()
+    actual = other.view.item.texture.grad.numpy()
     assert np.linalg.norm(expected) > 1e-6
-    assert np.linalg.norm(found - expected) < 1e-2 * np.linalg.norm(expected)
+    assert np.linalg.norm(actual - expected) < 1e-2 * np.linalg.norm(expected)

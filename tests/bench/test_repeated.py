@@ -44,8 +44,8 @@ def document(error: float, failure: str | None = None) -> str:
 
 
 def write(folder, scenario=""):
-    about = {"digests": {}, "versions": None, "scenario": scenario}
-    write_table(files.make_folder(folder), [ROW], {CELL: about})
+    cell = {"digests": {}, "versions": None, "scenario": scenario}
+    write_table(files.make_folder(folder), [ROW], {CELL: cell})
 
 
 @pytest.fixture
@@ -57,14 +57,14 @@ def studies(tmp_path, monkeypatch):
     grid = tmp_path / "grid.toml"
     grid.write_text(GRID)
     words = {"question": "?", "basis": "none", "core_hours": 1.0, "grid": str(grid)}
-    found = []
+    chosen = []
     for name in ("first", "second"):
         folder = tmp_path / "tables" / name
         write(folder)
         values = words | {"name": name, "table": str(folder)}
-        found.append(Study.model_validate(values))
-    monkeypatch.setattr(run, "choose", lambda names: found)
-    return found
+        chosen.append(Study.model_validate(values))
+    monkeypatch.setattr(run, "choose", lambda names: chosen)
+    return chosen
 
 
 def test_another_program_or_draw_makes_the_rows_in_another_folder(studies, monkeypatch):

@@ -101,13 +101,13 @@ def made(name: str, rows: pd.DataFrame):
 
 def test_a_side_is_farther_if_wilsons_interval_lies_above_one_half():
     """All of 6 places: low end 6 / (6 + 1.96²) = 0.61; 5 of 6: 0.44; of 4: unknown."""
-    for errors, wanted in (
+    for errors, expected in (
         ([0.2] * 6, (6, True)),
         ([0.2] * 5 + [0.05], (5, False)),
         ([0.2] * 4, (4, False)),
     ):
         other = drives(table({"attack": [0.1] * len(errors)}))
-        assert is_farther(drives(table({"attack": errors})), other) == wanted
+        assert is_farther(drives(table({"attack": errors})), other) == expected
 
 
 def test_equal_sides_are_seldom_farther_by_chance():
@@ -122,9 +122,9 @@ def test_the_attack_is_compared_with_the_worst_random_texture():
     cases = ("no_object", "random", "best_random", "attack")
     errors = {case: [0.1 + 0.1 * k] * 6 for k, case in enumerate(cases)}
     rows = drives(table(errors), table(errors).assign(environment="mitsuba"))
-    found = made("attack", rows)
-    assert found.title.endswith("at 6 of 6 places")
-    assert "0.400 m" in found.sentences[0] and "ratio 1.3" in found.sentences[0]
+    answer = made("attack", rows)
+    assert answer.title.endswith("at 6 of 6 places")
+    assert "0.400 m" in answer.sentences[0] and "ratio 1.3" in answer.sentences[0]
     rows.loc[rows["case"] == "attack", "cross_track_mean_m"] = 0.25
     assert "not shown" in made("attack", rows).title
 
@@ -132,8 +132,8 @@ def test_the_attack_is_compared_with_the_worst_random_texture():
 def test_a_title_claims_nothing_while_attacks_are_missing(study):
     labels = {"route": "a", "objects": "far", "method": "one"}
     write(study.folder, table({"attack": [0.1] * 3}, **labels))  # seeds 0, 1, 2
-    found = finding(study.model_copy(update={"finding": "searches"}))
-    assert found.title.endswith("best: 2 of 12 attacks exist")
+    answer = finding(study.model_copy(update={"finding": "searches"}))
+    assert answer.title.endswith("best: 2 of 12 attacks exist")
 
 
 def test_the_gradient_is_compared_with_each_search():
@@ -145,14 +145,14 @@ def test_the_gradient_is_compared_with_each_search():
     )
     cheap = rows["method"] == "single_frame"
     rows.loc[cheap, "frames"] = 7  # of 9
-    found = made("gradient", rows)
-    assert "farther than 1 of 2 searches without a gradient" in found.title
-    assert "0 of 0 other searches" in found.sentences[0]
-    assert "`single_frame`" in found.threats[0]
-    assert len(found.threats) == 1 + 6  # places where `blocks` is better
-    assert [row[3] for row in found.rows] == ["–", "2.00", "0.80", "4.00"]
-    assert [row[6] for row in found.rows] == ["–", "0.20 m", "-0.10 m", "0.30 m"]
-    assert "`blocks`" in found.sentences[1] and "0 to 6 of 6" in found.sentences[2]
+    answer = made("gradient", rows)
+    assert "farther than 1 of 2 searches without a gradient" in answer.title
+    assert "0 of 0 other searches" in answer.sentences[0]
+    assert "`single_frame`" in answer.threats[0]
+    assert len(answer.threats) == 1 + 6  # places where `blocks` is better
+    assert [row[3] for row in answer.rows] == ["–", "2.00", "0.80", "4.00"]
+    assert [row[6] for row in answer.rows] == ["–", "0.20 m", "-0.10 m", "0.30 m"]
+    assert "`blocks`" in answer.sentences[1] and "0 to 6 of 6" in answer.sentences[2]
 
 
 def test_transfer_counts_places_not_attacks():
@@ -168,10 +168,10 @@ def test_transfer_counts_places_not_attacks():
             ("no_object", 0.1),
         )
     ]
-    found = made("transfer", pd.DataFrame(rows))
-    assert "in 1 of 2 environments, under half in 1" in found.title
-    assert "5 places with 10 attacks" in found.sentences[2]
-    assert found.rows == [
+    answer = made("transfer", pd.DataFrame(rows))
+    assert "in 1 of 2 environments, under half in 1" in answer.title
+    assert "5 places with 10 attacks" in answer.sentences[2]
+    assert answer.rows == [
         ["kept", "0.80", "0.80 to 0.80", "0.10"],
         ["lost", "0.20", "0.20 to 0.20", "0.10"],
     ]
@@ -195,22 +195,22 @@ def test_light_counts_aims_and_where_varying_helps():
     where = {("surrogate", "day"): 1.0, ("mitsuba", "day"): 0.88}
     where |= {("mujoco_built_in", "day"): 0.72, ("mitsuba", "evening"): 0.59}
     rows = light_rows({"plain": 1.0, "vary": 2.0}, where)
-    found = made("light", rows)
-    assert "helps attacks in 3 of 3" in found.title and "aim in 1" in found.title
-    assert found.sentences[1].endswith("`plain` reaches the aim in 1 rows.")
-    assert "5 attacks with `vary` and 5 attacks with `plain`" in found.sentences[0]
+    answer = made("light", rows)
+    assert "helps attacks in 3 of 3" in answer.title and "aim in 1" in answer.title
+    assert answer.sentences[1].endswith("`plain` reaches the aim in 1 rows.")
+    assert "5 attacks with `vary` and 5 attacks with `plain`" in answer.sentences[0]
     missed = "misses it in `mitsuba` day, `mitsuba` evening."
-    assert missed in found.sentences[1] and "in 1 of 3 rows" in found.sentences[1]
-    by_place = {tuple(row[:2]): row[2:7] for row in found.rows}
+    assert missed in answer.sentences[1] and "in 1 of 3 rows" in answer.sentences[1]
+    by_place = {tuple(row[:2]): row[2:7] for row in answer.rows}
     assert {place: [row[0], *row[2:]] for place, row in by_place.items()} == {
         ("mitsuba", "day"): ["0.88", "0.90", "0.88", "0.22"],
         ("mujoco_built_in", "day"): ["0.72", "0.70", "0.72", "0.18"],
         ("mitsuba", "evening"): ["0.59", "0.60", "0.59", "0.15"],
     }
-    for kept, ends, *_ in by_place.values():
-        assert ends in (f"{kept} to {kept}", f"{kept} to {float(kept) + 0.01:.2f}")
-    assert {row[7] for row in found.rows} == {"2.00 to 2.01"}
-    threat = found.threats[-1]
+    for share, ends, *_ in by_place.values():
+        assert ends in (f"{share} to {share}", f"{share} to {float(share) + 0.01:.2f}")
+    assert {row[7] for row in answer.rows} == {"2.00 to 2.01"}
+    threat = answer.threats[-1]
     assert "leaves the lane at 2 places" in threat and "lane at 2 of them" in threat
     assert threat.endswith("The attacks at the other 3 places keep 0.72 there.")
     alone = made("light", rows[rows["attack"].str.contains("vary")])
@@ -223,8 +223,8 @@ def test_the_second_place_has_the_rule_of_the_first():
     cases = ("no_object", "random", "best_random", "attack")
     errors = {case: [0.1 + 0.1 * k] * 6 for k, case in enumerate(cases)}
     rows = drives(table(errors), table(errors).assign(environment="mitsuba"))
-    found = made("country", rows)
-    assert found.title.startswith("On a country road") and "6 of 6" in found.title
+    answer = made("country", rows)
+    assert answer.title.startswith("On a country road") and "6 of 6" in answer.title
 
 
 def test_the_parts_of_varying_are_compared_with_nothing():
@@ -237,17 +237,17 @@ def test_the_parts_of_varying_are_compared_with_nothing():
         for route, error in (("left", 0.1), ("right", 0.4))
         for environment, share in (("surrogate", 1.0), ("mitsuba", 0.5))
     )
-    found = made("parts", rows)
-    assert found.title.startswith("2 places") and "`camera`" in found.title
-    assert "2.00 times" in found.title
+    answer = made("parts", rows)
+    assert answer.title.startswith("2 places") and "`camera`" in answer.title
+    assert "2.00 times" in answer.title
     factors = ["0.50", "2.00", "1.00", "2.50"]
-    assert found.head[3:] == ["light", "camera", "vehicle", "all parts"]
-    assert found.rows == [
+    assert answer.head[3:] == ["light", "camera", "vehicle", "all parts"]
+    assert answer.rows == [
         ["surrogate", "day", "0.200", *factors],
         ["mitsuba", "day", "0.100", *factors],
     ]
-    assert "0.50 with `light`" in found.sentences[0]
-    assert "`camera` in 2, `vehicle` in 0" in found.sentences[1]
+    assert "0.50 with `light`" in answer.sentences[0]
+    assert "`camera` in 2, `vehicle` in 0" in answer.sentences[1]
 
 
 def test_limits_counts_places_beyond_the_lane():
@@ -259,11 +259,11 @@ def test_limits_counts_places_beyond_the_lane():
         )
         for seed in (1, 2)
     ]
-    found = made("limits", pd.DataFrame(rows))
-    assert found.title.endswith("at 2 of 4 places")
-    assert [row[2] for row in found.rows] == ["2/2", "0/2"]
-    assert "a patch on the route `left`" in found.sentences[1]
-    assert "0.10 rad/s" in found.sentences[1]
+    answer = made("limits", pd.DataFrame(rows))
+    assert answer.title.endswith("at 2 of 4 places")
+    assert [row[2] for row in answer.rows] == ["2/2", "0/2"]
+    assert "a patch on the route `left`" in answer.sentences[1]
+    assert "0.10 rad/s" in answer.sentences[1]
 
 
 def test_charts_draw_ratios_intervals_and_heat():
@@ -301,16 +301,16 @@ def study(tmp_path, monkeypatch):
 
 def write(folder, rows):
     plain = rows[list(COLUMNS)].astype(object)
-    kept = plain.where(plain.notna(), None).to_dict("records")
-    about = {"digests": {}, "versions": None, "scenario": ""}
-    write_table(files.make_folder(folder), kept, dict.fromkeys(rows["cell"], about))
+    records = plain.where(plain.notna(), None).to_dict("records")
+    cell = {"digests": {}, "versions": None, "scenario": ""}
+    write_table(files.make_folder(folder), records, dict.fromkeys(rows["cell"], cell))
 
 
 def test_a_table_is_never_replaced_by_one_with_fewer_attacks(study, capsys):
-    for count, kept in ((2, 2), (1, 2), (3, 3)):
+    for count, stored in ((2, 2), (1, 2), (3, 3)):
         write(study.work, table({"attack": [0.1 * count] * count}))
         run.refresh(study)
-        assert len(study.read()) == kept
+        assert len(study.read()) == stored
     assert "1 cells" in capsys.readouterr().out
     document = json.loads((study.folder / "summary.json").read_text())
     assert document["complete"] == 3
@@ -344,8 +344,8 @@ def test_a_check_writes_the_differences_next_to_the_table(study, monkeypatch, ca
     write(study.folder, table({"attack": [0.1] * 12}))
     largest = {"cross_track_mean_m": 0.25}
     cell = {"cell": "c", "rows": 2, "unmatched": 0, "error": None, "versions": {}}
-    told = {"cells": [cell | {"largest_difference": largest}]}
-    monkeypatch.setattr(run, "run_for_output", lambda words: (0, json.dumps(told)))
+    report = {"cells": [cell | {"largest_difference": largest}]}
+    monkeypatch.setattr(run, "run_for_output", lambda words: (0, json.dumps(report)))
     assert main(["results", "--check", "--seed", "5", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     stored = json.loads((study.folder / "check.json").read_text())

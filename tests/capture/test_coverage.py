@@ -59,9 +59,10 @@ def test_where_the_points_of_a_picture_begin():
     cameras, poses = around(0, 90)
     along = np.linspace(1.0, -1, 201)
     points = np.stack([along, 0 * along, 0 * along], axis=1)
-    found = nearest_points(cameras, poses, points)  # 1 to 3 m before the first camera
-    assert found[0] == pytest.approx(1.02, abs=0.01)  # but for 1 %
-    assert found[1] == pytest.approx(2, abs=0.01)
+    # 1 to 3 m before the first camera
+    distances = nearest_points(cameras, poses, points)
+    assert distances[0] == pytest.approx(1.02, abs=0.01)  # but for 1 %
+    assert distances[1] == pytest.approx(2, abs=0.01)
     assert nearest_points(cameras, poses, points[::3]).tolist() == [0, 0]
 
 
@@ -82,7 +83,7 @@ def taken(tmp_path):
     placed = [i for i in range(COUNT) if i != LOST]
     angles = [i / 12 + 0.6 * (i == ALONE) for i in placed]
     poses = [look_at([np.cos(a), np.sin(a), 1.0], [0, 0, 0]) for a in angles]
-    found = Structure(
+    structure = Structure(
         tuple(names[i] for i in placed),
         np.stack(poses),
         (LENS,) * len(placed),
@@ -92,12 +93,12 @@ def taken(tmp_path):
         tuple(0.1 * i for i in placed),
         {name: 120 if i == BARE else 2000 for i, name in enumerate(names)},
     )
-    return tmp_path, names, found
+    return tmp_path, names, structure
 
 
 def test_what_to_take_again(taken):
-    folder, names, found = taken
-    qualities = assess(folder, names, found)
+    folder, names, structure = taken
+    qualities = assess(folder, names, structure)
     again = retake(qualities)
     assert list(again) == [names[i] for i in (BLURRED, LOST, BARE, ALONE)]
     reasons = [why.partition(" ")[0] for why in again.values()]
@@ -107,7 +108,7 @@ def test_what_to_take_again(taken):
     assert gaps.pop(LOST) is None and gaps[-1] == max(gaps)
     assert qualities[3].error_px == pytest.approx(0.3)
     assert qualities[LOST].error_px is None and qualities[LOST].features == 2000
-    table = quality_table(found, qualities, {"metres_per_unit": None})
+    table = quality_table(structure, qualities, {"metres_per_unit": None})
     assert (table["photographs"], table["placed"]) == (COUNT, COUNT - 1)
     assert table["placed_share"] == pytest.approx((COUNT - 1) / COUNT)
     assert table["frames"][BARE]["points"] == 40 and table["retake"] == again

@@ -203,8 +203,8 @@ def test_points_file(tmp_path):
     points = np.arange(6.0).reshape(2, 3)
     for stored, expected in ((points, points), (points[:0], None)):
         files.write_safetensors(tmp_path / "p.safetensors", {"points": stored})
-        found = write_posed(tmp_path, points_file="p.safetensors").points
-        np.testing.assert_array_equal(found, expected)
+        read_points = write_posed(tmp_path, points_file="p.safetensors").points
+        np.testing.assert_array_equal(read_points, expected)
 
 
 @pytest.mark.parametrize("is_turned", [True, False])
@@ -213,7 +213,7 @@ def test_points_of_nerfstudio(tmp_path, is_turned, rng):
     turn = np.c_[[[0.0, 1, 0], [1, 0, 0], [0, 0, -1]], [1.0, -4, 2]]
     stored = points if is_turned else (points - turn[:, 3]) @ turn[:, :3]
     keys = {"applied_transform": turn.tolist()}
-    found = write_posed(tmp_path, ply_file_path=write_points(tmp_path, stored), **keys)
-    np.testing.assert_allclose(found.points, points, atol=1e-6)
+    images = write_posed(tmp_path, ply_file_path=write_points(tmp_path, stored), **keys)
+    np.testing.assert_allclose(images.points, points, atol=1e-6)
     keys["ply_file_path"] = write_points(tmp_path, points[:0])
     assert write_posed(tmp_path, **keys).points is None

@@ -89,9 +89,9 @@ def mesh(folder, away):
 
 
 def field(folder, away):
-    found = blob(np.random.default_rng(0))
-    found.lower, found.upper = found.lower + away, found.upper + away
-    save_field(folder / "a.safetensors", found)
+    grid = blob(np.random.default_rng(0))
+    grid.lower, grid.upper = grid.lower + away, grid.upper + away
+    save_field(folder / "a.safetensors", grid)
     return load_field(folder / "a.safetensors")
 
 

@@ -68,10 +68,10 @@ class TestReadViews:
     def test_placed_on_the_ground(self, tmp_path):
         """Metric, centred, on z = 0, and the cameras move along."""
         before = folder(tmp_path, moved=(3.0, -2.0, 5.0)).camera_to_world
-        found = read_views(tmp_path, Placement(height_m=2.0))
-        assert found.upper[2] == pytest.approx(2.0) and found.lower[2] == 0
-        np.testing.assert_allclose(found.lower[:2], -found.upper[:2])
-        after = found.images.camera_to_world
+        views = read_views(tmp_path, Placement(height_m=2.0))
+        assert views.upper[2] == pytest.approx(2.0) and views.lower[2] == 0
+        np.testing.assert_allclose(views.lower[:2], -views.upper[:2])
+        after = views.images.camera_to_world
         apart = [np.linalg.norm(p[0, :3, 3] - p[9, :3, 3]) for p in (after, before)]
         scale = apart[0] / apart[1]
         # the ball's centre, wherever exactly the box of its hull lies
@@ -81,8 +81,8 @@ class TestReadViews:
 
     def test_axes_and_turn(self, tmp_path):
         old = folder(tmp_path).camera_to_world
-        found = read_views(tmp_path, Placement(up="x", turn_deg=90.0))
-        new = found.images.camera_to_world
+        views = read_views(tmp_path, Placement(up="x", turn_deg=90.0))
+        new = views.images.camera_to_world
         # x goes up; then the world turns by 90 degrees: what was y points to -x
         np.testing.assert_allclose(new[:, 2, :3], old[:, 0, :3], atol=1e-12)
         np.testing.assert_allclose(new[:, 0, :3], -old[:, 1, :3], atol=1e-12)
@@ -94,10 +94,10 @@ class TestReadViews:
         (tmp_path / "images/0023.png").unlink()
         with pytest.raises(InputError, match="transforms.json: 1 of 24"):
             read_views(tmp_path, Placement())
-        found = read_views(tmp_path, Placement(), box, skip_missing=True)
+        views = read_views(tmp_path, Placement(), box, skip_missing=True)
         poses = before.camera_to_world[:-1]
-        np.testing.assert_allclose(found.images.camera_to_world, poses, atol=1e-12)
-        np.testing.assert_allclose([found.lower, found.upper], [box[:3], box[3:]])
+        np.testing.assert_allclose(views.images.camera_to_world, poses, atol=1e-12)
+        np.testing.assert_allclose([views.lower, views.upper], [box[:3], box[3:]])
 
 
 class TestCommand:
@@ -148,12 +148,12 @@ class TestCommand:
             patch.setattr(progress.StageBars, "show", interrupt)
             with pytest.raises(KeyboardInterrupt):
                 command.run()
-        kept = tmp_path / "box.checkpoint.safetensors"
-        assert kept.is_file() and not out.exists()
+        checkpoint = tmp_path / "box.checkpoint.safetensors"
+        assert checkpoint.is_file() and not out.exists()
         with pytest.raises(InputError, match=r"box\.checkpoint\.saf.*\n  fit: "):
             replace(command, turn_deg=1.0).run()
         assert command.run().tell(False) == 0
-        assert out.is_file() and not kept.exists()
+        assert out.is_file() and not checkpoint.exists()
 
     @pytest.mark.slow
     def test_a_folder_becomes_an_object(self, tmp_path, capsys):
@@ -242,8 +242,8 @@ class TestAsset:
         inner = (np.abs(at - [0, 1, 1]).max(1) < 0.5) & (np.abs(axes[:, 1]) > 0.5)
         assert inner.sum() >= 3
         # four pixels meet in the middle of an even image
-        found = depth[inner, 7:9, 7:9].mean((1, 2))
-        np.testing.assert_allclose(found, reach[inner], rtol=0.02)
+        mean_depth = depth[inner, 7:9, 7:9].mean((1, 2))
+        np.testing.assert_allclose(mean_depth, reach[inner], rtol=0.02)
         pixels, expected = images.images[inner, 8, 8], linear_to_uint8(np.array(colour))
         assert np.abs(pixels[:, :3].astype(int) - expected).max() <= 3
         assert np.all(pixels[:, 3] == 255)

@@ -58,12 +58,12 @@ def test_spread_beside_narrow_lanes_and_loops():
     assert 0.5 < np.abs(away).max() <= 0.3 + 0.6 * 3 / 7 + 1e-9
 
 
-def write_world(folder: Path, place: str = "", more: str = "", **route) -> list[Path]:
+def write_world(folder: Path, place: str = "", extra: str = "", **route) -> list[Path]:
     """Write a floor of 200 m with a straight route, and return their paths."""
     (folder / "scene.xml").write_text(
         '<scene version="3.0.0"><integrator type="path"/><emitter type="constant"/>'
         '<shape type="rectangle"><transform name="to_world"><scale value="100"/>'
-        f"{place}</transform></shape>{more}</scene>"
+        f"{place}</transform></shape>{extra}</scene>"
     )
     points = straight_route().points.tolist()
     route = {
@@ -77,21 +77,21 @@ def write_world(folder: Path, place: str = "", more: str = "", **route) -> list[
 
 
 def test_capture_scene(tmp_path):
-    out, seen, lens = tmp_path / "out", [], from_fov(16, 8, 90.0)
+    out, calls, lens = tmp_path / "out", [], from_fov(16, 8, 90.0)
     capture = partial(capture_scene, *write_world(tmp_path))
-    path = capture(out, 3, lens, 4, 0, lambda *call: seen.append(call))
+    path = capture(out, 3, lens, 4, 0, lambda *call: calls.append(call))
     read = read_transforms(path)
-    assert seen == [(1, 3), (2, 3), (3, 3)] and read.images.shape == (3, 8, 16, 3)
+    assert calls == [(1, 3), (2, 3), (3, 3)] and read.images.shape == (3, 8, 16, 3)
     depth = files.read_safetensors(out / "depth.safetensors")[0]["depth"]
     height = read.camera_to_world[:, 2, 3]
     # the ray through the bottom row hits the ground, z = 0
     bottom = np.isfinite(depth[:, -1, 8])
     np.testing.assert_array_less(height[bottom], depth[bottom, -1, 8])
 
-    kept = {file: file.stat().st_mtime_ns for file in out.rglob("*.*")}
-    assert len(kept) == 5  # three images, their depth and their poses
+    times_ns = {file: file.stat().st_mtime_ns for file in out.rglob("*.*")}
+    assert len(times_ns) == 5  # three images, their depth and their poses
     assert capture(out, 3, lens, 4, 0) == path
-    assert kept == {file: file.stat().st_mtime_ns for file in out.rglob("*.*")}
+    assert times_ns == {file: file.stat().st_mtime_ns for file in out.rglob("*.*")}
     with pytest.raises(InputError, match=r"capture\.seed: 0 -> 1"):
         capture(out, 3, lens, 4, 1)
 
@@ -105,12 +105,12 @@ def test_capture_scene(tmp_path):
     assert is_begun(again) and len(list(again.glob("views/*"))) == 2
     capture(again, 3, lens, 4, 0)
     assert not (again / "views").exists()
-    for file in kept:
+    for file in times_ns:
         assert (again / file.relative_to(out)).read_bytes() == file.read_bytes()
 
 
 @pytest.mark.parametrize(
-    ("place", "found"),
+    ("place", "message"),
     [
         ('<rotate x="1" angle="-90"/>', "z -100 to 100"),  # y up
         ('<translate x="150"/>', "scene.xml .*x 50 to 250"),
@@ -118,11 +118,11 @@ def test_capture_scene(tmp_path):
     ],
 )
 def test_routes_without_ground_are_refused_before_a_view_is_rendered(
-    tmp_path, place, found
+    tmp_path, place, message
 ):
     # within the floor where y is up
     paths = write_world(tmp_path, place, points_m=[[0.0, 0.0], [20.0, 0.0]])
-    with pytest.raises(InputError, match=f"routes.json: .*{found}"):
+    with pytest.raises(InputError, match=f"routes.json: .*{message}"):
         capture_scene(*paths, tmp_path / "out", 3, from_fov(16, 8, 90.0), 4, seed=0)
     assert not (tmp_path / "out").exists()
 

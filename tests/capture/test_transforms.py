@@ -152,22 +152,22 @@ class TestTransforms:
     )
     def test_unusable_fields(self, folder, frame, key, value, message):
         def edit(table):
-            found = table if frame is None else table["frames"][frame]
-            found[key] = value.tolist() if isinstance(value, np.ndarray) else value
+            entry = table if frame is None else table["frames"][frame]
+            entry[key] = value.tolist() if isinstance(value, np.ndarray) else value
 
         where = "" if frame is None else rf"frames\[{frame}\].*"
         with pytest.raises(InputError, match=f"transforms.json: .*{where}{message}"):
             read_transforms(edited(folder, edit))
 
 
-def posed(*channels: int, place: float = 0.0, **more) -> PosedImages:
+def posed(*channels: int, place: float = 0.0, **options) -> PosedImages:
     """Make images of so many channels each, the first at a place."""
     images, poses = some_frames(2)
     images = [np.resize(images[0], (8, 12, c)) for c in channels]
     images = stacked(images) if images else np.zeros((0, 8, 12, 3), np.uint8)
     poses[0, 1, 3] = place
     count = len(channels)
-    return PosedImages(images, poses[:count], CAMERA, ("a", "b")[:count], **more)
+    return PosedImages(images, poses[:count], CAMERA, ("a", "b")[:count], **options)
 
 
 OTHER = CAMERA, Camera(9, 8, 9.0, 9.0, 4.5, 4.0)
@@ -190,9 +190,9 @@ class TestFolders:
     def test_nerfstudio(self, tmp_path):
         read = read_images(nerfstudio(tmp_path))
         assert len(read.cameras) == 3
-        for i, found in enumerate(read.cameras):
+        for i, camera in enumerate(read.cameras):
             numbers = 10.0 + i, 11.0 + i, 6.25, 3.75, 0.01 * i
-            assert found == Camera(WIDTH, HEIGHT, *numbers)
+            assert camera == Camera(WIDTH, HEIGHT, *numbers)
         half = read_images(tmp_path, long_edge_px=6)
         assert half.camera_of(2).fx == 6.0 and half.camera_of(2).k1 == 0.02
         assert half.images.shape == (3, 4, 6, 3)

@@ -68,9 +68,9 @@ def test_every_module_is_imported_without_them():
 )
 def test_a_command_runs_or_says_what_it_lacks(words, code, message):
     done = run(MAIN, *words)
-    told = " ".join((done.stdout + done.stderr).split())
-    assert (done.returncode, message in told) == (code, True), told
-    assert "Traceback" not in told
+    output = " ".join((done.stdout + done.stderr).split())
+    assert (done.returncode, message in output) == (code, True), output
+    assert "Traceback" not in output
 
 
 @pytest.mark.slow

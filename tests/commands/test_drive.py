@@ -41,9 +41,13 @@ def test_a_drive_is_stated_driven_and_logged(tmp_path, variant, capsys):
     words = [*SIMULATED, "-o", str(log), "--json"]
     assert main([*words, "--set", "duration_s=2"]) == 0
     out, err = capsys.readouterr()
-    told = json.loads(out)
-    assert (told["end"], told["braked"], told["log"]) == ("time is up", True, str(log))
-    figures = told["figures"]
+    document = json.loads(out)
+    assert (document["end"], document["braked"], document["log"]) == (
+        "time is up",
+        True,
+        str(log),
+    )
+    figures = document["figures"]
     assert figures["commands"] == 19 and figures["largest_error_m"] < 0.1
     assert max(err.index("Mount "), err.index("Fence ")) < err.index("Armed.")
     recording = open_recording(log, None, CameraMount())
@@ -52,8 +56,8 @@ def test_a_drive_is_stated_driven_and_logged(tmp_path, variant, capsys):
     assert main(words) == 2  # never written over
     assert f"{log}: exists" in capsys.readouterr().err and log.read_bytes() == before
     assert main([*SIMULATED, "--dry-run", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)["refused"]
-    assert told == dict.fromkeys(("camera", "tracker", "motor", "policy", "enable"))
+    refused = json.loads(capsys.readouterr().out)["refused"]
+    assert refused == dict.fromkeys(("camera", "tracker", "motor", "policy", "enable"))
 
 
 def test_an_attacked_box_stands_in_what_the_policy_sees(
@@ -70,9 +74,9 @@ def test_an_attacked_box_stands_in_what_the_policy_sees(
     assert "Overlay    the attacked box of runs/found" in capsys.readouterr().out
     recording = open_recording(log, None, CameraMount())
     image = recording.image(0).astype(int)
-    seen = np.abs(image - COLOURS["back"]).max(-1) < 40
-    rows, columns = np.nonzero(seen)
-    assert seen.sum() > 100 and abs(columns.mean() - 100) < 5
+    mask = np.abs(image - COLOURS["back"]).max(-1) < 40
+    rows, columns = np.nonzero(mask)
+    assert mask.sum() > 100 and abs(columns.mean() - 100) < 5
     assert 7 < rows.min() and rows.max() < 30  # half of it above the horizon
 
 
@@ -87,19 +91,19 @@ def test_the_rooms_policy_stays_in_its_lane(tmp_path, variant, capsys):
 POLICY = '[policy]\nfile = "bundled:policy/pilotnet.safetensors"\n'
 
 
-@pytest.mark.parametrize("more", ["", '[vehicle]\nkind = "dubins"\n'])
-def test_a_policy_is_driven_in_its_own_unit(tmp_path, more):
+@pytest.mark.parametrize("section", ["", '[vehicle]\nkind = "dubins"\n'])
+def test_a_policy_is_driven_in_its_own_unit(tmp_path, section):
     """The bundled one gives a heading rate, which is no steering angle."""
     path, command = tmp_path / "policy.toml", DriveCommand()
-    path.write_text(POLICY + more)
-    given = {"policy": str(path)}
-    config, _ = command._trained(read_config(None, given))
+    path.write_text(POLICY + section)
+    options = {"policy": str(path)}
+    config, _ = command._trained(read_config(None, options))
     assert config.control_unit == "rad/s"
     with pytest.raises(InputError, match="control_unit: 'rad', and .* 'rad/s'"):
-        command._trained(read_config(None, given | {"control_unit": "rad"}))
+        command._trained(read_config(None, options | {"control_unit": "rad"}))
     path.write_text(POLICY + '[vehicle]\nkind = "ackermann"\n')
     with pytest.raises(InputError, match="takes rad, and .* gives rad/s"):
-        command._trained(read_config(None, given))
+        command._trained(read_config(None, options))
 
 
 def test_a_policy_drives_the_car_that_it_was_trained_for():
@@ -161,16 +165,16 @@ def test_all_devices_are_asked(kind, held, code, message, capsys):
     bench.at(2.0, lambda: setattr(bench, "held", held[1]))
     rig = rig_of(bench, kind(bench), stand_ins.StandInEnable(bench))
     assert _dry_run(rig, stand_ins.SETTINGS).tell(as_json=False) == code
-    told = capsys.readouterr().out.splitlines()[1:]
-    assert message in "\n".join(told)
-    assert sum("ready" in line for line in told) == 5 - code and not bench.events
+    lines = capsys.readouterr().out.splitlines()[1:]
+    assert message in "\n".join(lines)
+    assert sum("ready" in line for line in lines) == 5 - code and not bench.events
 
 
 @pytest.mark.parametrize("is_simulated", [True, False])
 def test_a_drive_that_sent_nothing_leaves_no_log(tmp_path, is_simulated, capsys):
     bench, log = stand_ins.Bench(), tmp_path / "drive.mcap"
-    given = {"policy": "expert", "simulated": is_simulated, "log": str(log)}
-    config = read_config(None, given)
+    options = {"policy": "expert", "simulated": is_simulated, "log": str(log)}
+    config = read_config(None, options)
     if is_simulated:  # Ctrl-C before the button is pressed
         bench.at(0.5, lambda: signal.raise_signal(signal.SIGINT))
         rig = rig_of(
@@ -208,8 +212,8 @@ def test_a_policy_behind_a_url_drives(tmp_path, variant, capsys):
         for setting in ("duration_s=0.3", "control_unit=rad", f"token_file={token}"):
             words += ["--set", setting]
         assert main(words) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["end"] == "time is up" and told["figures"]["latency_99_s"] < 1
+    document = json.loads(capsys.readouterr().out)
+    assert document["end"] == "time is up" and document["figures"]["latency_99_s"] < 1
     steps = [int(headers["X-Step"]) for headers, _ in asked]
     again = steps.index(0, 1)  # the policy begins anew when the button is pressed
     assert steps == [*range(again), *range(len(steps) - again)]
@@ -272,6 +276,9 @@ def test_a_server_of_its_own(tmp_path):
         process.send_signal(signal.SIGCONT)
         process.send_signal(signal.SIGINT)
         out, _ = process.communicate(timeout=60)
-    told = json.loads(out)
-    assert process.returncode == 0 and told["decisions"] >= 2
-    assert 0 < told["median_s"] <= told["within_s_95"] and told["strangers"] == 1
+    document = json.loads(out)
+    assert process.returncode == 0 and document["decisions"] >= 2
+    assert (
+        0 < document["median_s"] <= document["within_s_95"]
+        and document["strangers"] == 1
+    )

@@ -61,18 +61,18 @@ def test_two_processes_share_a_folder_of_drives(place, monkeypatch):
 
     Each drive that both make is one's or the other's, whole.
     """
-    whole, cards, steps = places.PaintedEnvironment.step, [], 0
+    original, cards, steps = places.PaintedEnvironment.step, [], 0
 
     def step(self, control):
         nonlocal steps
         steps += 1
         if steps == 100:
             cards.append(card_of(place, "kept"))
-        return whole(self, control)
+        return original(self, control)
 
     monkeypatch.setattr(places.PaintedEnvironment, "step", step)
-    found = card_of(place, "kept")
-    assert found == cards[0] == card_of(place, "whole")
+    card = card_of(place, "kept")
+    assert card == cards[0] == card_of(place, "whole")
     assert {path.suffix for path in Path("kept").rglob("*.*")} == {".safetensors"}
 
 
@@ -123,11 +123,11 @@ def test_pages_are_named_after_the_policy_and_count_all_drives():
 
 def test_one_process_asks_a_server_that_may_keep_a_state():
     """It starts anew where step is 0, and cannot tell the drives of two apart."""
-    here = ProgramSection(kind="onnx", file="mine.onnx")
-    there = HttpSection(kind="http", url="http://a:1")
-    assert Evaluate()._workers(there) == InThisProcess()
-    assert Evaluate(workers=2)._workers(there) == Processes(2)
-    assert Evaluate(workers=3)._workers(here) == Processes(3)
+    local = ProgramSection(kind="onnx", file="mine.onnx")
+    remote = HttpSection(kind="http", url="http://a:1")
+    assert Evaluate()._workers(remote) == InThisProcess()
+    assert Evaluate(workers=2)._workers(remote) == Processes(2)
+    assert Evaluate(workers=3)._workers(local) == Processes(3)
 
 
 def test_numbers_of_objects_are_cases_and_add_drives(place, capsys):
@@ -138,16 +138,16 @@ def test_numbers_of_objects_are_cases_and_add_drives(place, capsys):
     assert cli.main(command) == 0
     first = json.loads(capsys.readouterr().out)["mitsuba"]["straight"]
     files_there = Path("runs").rglob("*_000*.safetensors")
-    kept = {path: path.stat().st_mtime_ns for path in files_there}
+    times_ns = {path: path.stat().st_mtime_ns for path in files_there}
     assert cli.main([*command, "--objects", "0", "1", "6", "--scale", "1", "2"]) == 0
     scaled = json.loads(capsys.readouterr().out)["mitsuba"]["straight"]
     assert list(scaled) == ["no_object", "random", "random_6"]
     assert cli.main([*command, "--objects", "6", "1", "--page", "page"]) == 0
-    found = json.loads(capsys.readouterr().out)["mitsuba"]["straight"]
-    assert {case: found[case] for case in first} == first
-    assert all(path.stat().st_mtime_ns == then for path, then in kept.items())
+    figures = json.loads(capsys.readouterr().out)["mitsuba"]["straight"]
+    assert {case: figures[case] for case in first} == first
+    assert all(path.stat().st_mtime_ns == then for path, then in times_ns.items())
     assert "random_6" in Path("page/still-drive.md").read_text()
-    starts = [[run["start"] for run in found[case]["per_run"]] for case in found]
+    starts = [[run["start"] for run in figures[case]["per_run"]] for case in figures]
     assert starts[0] == starts[1] == starts[2]
 
 
@@ -188,8 +188,8 @@ def test_a_toml_file_brings_camera_and_vehicle_of_its_policy(
     """Radians of steering turn by speed / wheelbase * tan, no heading rate does."""
     monkeypatch.setattr(evaluate_work, "make_environment", make_environment)
     Path("mine.toml").write_text(TURNING)
-    seen = "    assert image.shape[1:] == (3, 2, 4), image.shape\n"
-    Path("turn.py").write_text(f"def drive(image, *_):\n{seen}    return [0.2]\n")
+    assertion = "    assert image.shape[1:] == (3, 2, 4), image.shape\n"
+    Path("turn.py").write_text(f"def drive(image, *_):\n{assertion}    return [0.2]\n")
     place = places.with_policy("mine.toml", place)
     assert cli.main([*place, "--horizon", "3", "--runs", "1", "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)["mitsuba"]["straight"]["no_object"]
@@ -268,10 +268,10 @@ def test_no_expert_drives_a_vehicle_whose_control_nobody_knows(
 
 
 def test_a_scenario_is_driven_in_its_own_scene(place, monkeypatch, capsys):
-    painted, seen = evaluate_work.make_environment, []
+    painted, opened = evaluate_work.make_environment, []
 
     def make(name, where, conditions=None):
-        seen.append(where)
+        opened.append(where)
         return painted(name, where, conditions)
 
     monkeypatch.setattr(evaluate_work, "make_environment", make)
@@ -290,32 +290,32 @@ def test_a_scenario_is_driven_in_its_own_scene(place, monkeypatch, capsys):
     short = ["--horizon", "2", "--objects", "0", "--json"]
     assert cli.main([*own, *short]) == 0
     assert list(json.loads(capsys.readouterr().out)["mitsuba"]) == ["lane"]
-    assert seen[0].scene.name == "deployment.xml"
-    assert seen[0].field.name == "scene.safetensors"
-    assert [path.name for path in seen[0].objects] == ["object.safetensors"]
-    assert seen[0].car.control_unit == "rad" and seen[0].motion is not None
+    assert opened[0].scene.name == "deployment.xml"
+    assert opened[0].field.name == "scene.safetensors"
+    assert [path.name for path in opened[0].objects] == ["object.safetensors"]
+    assert opened[0].car.control_unit == "rad" and opened[0].motion is not None
     # other objects stand in the scenario's scene, too
-    seen.clear()
+    opened.clear()
     save_field("mine.safetensors", places.small_grid())
     assert cli.main([*own, *short, "--object", "mine.safetensors"]) == 0
     assert list(json.loads(capsys.readouterr().out)["mitsuba"]) == ["lane"]
-    assert seen[0].scene.name == "deployment.xml"
-    assert [path.name for path in seen[0].objects] == ["mine.safetensors"]
+    assert opened[0].scene.name == "deployment.xml"
+    assert [path.name for path in opened[0].objects] == ["mine.safetensors"]
     # another scene
-    seen.clear()
+    opened.clear()
     assert cli.main([*command, *short]) == 0
     assert list(json.loads(capsys.readouterr().out)["mitsuba"]) == ["straight", "lane"]
-    assert seen[0].scene.name == "scene.xml" and seen[0].car.control_unit == "rad"
+    assert opened[0].scene.name == "scene.xml" and opened[0].car.control_unit == "rad"
 
 
 def test_options_replace_parts_of_a_scenarios_place():
     room = PolicyFile.read(str(bundled("room.toml")))
-    whole = room.place(PlaceOptions())
+    unchanged = room.place(PlaceOptions())
     for key, option in (("field", "field"), ("routes", "routes_file")):
         changed = room.place(PlaceOptions(**{option: Path("mine")}))
-        assert changed == replace(whole, **{key: Path("mine")})
+        assert changed == replace(unchanged, **{key: Path("mine")})
     changed = room.place(PlaceOptions(object=(Path("mine"),)))
-    assert changed == replace(whole, objects=(Path("mine"),))
+    assert changed == replace(unchanged, objects=(Path("mine"),))
     other = room.place(PlaceOptions(scene=Path("s.xml"), routes_file=Path("r.json")))
     assert (other.scene, other.field, other.objects) == (Path("s.xml"), None, ())
 

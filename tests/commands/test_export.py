@@ -126,7 +126,7 @@ class TestPaintedMesh:
     def test_colours_of_the_sides(self, inside_out):
         source = self.cube()
         if inside_out:
-            part = source.parts[0]
+            part = source.submeshes[0]
             turned = meshes.MeshPart(part.vertices, part.faces[:, ::-1])
             source = meshes.TexturedMesh("block", (turned,))
         mesh = painted_mesh(solid_field(block), source)
@@ -157,17 +157,17 @@ def test_glb_is_read_back_as_it_was(tmp_path):
     """By our reader and by trimesh: places, axes and linear colours, dark ones too."""
     mesh = field_surface(solid_field(block))
     write_glb(tmp_path / "a.glb", mesh)
-    part = load_mesh(tmp_path / "a.glb").parts[0]
+    part = load_mesh(tmp_path / "a.glb").submeshes[0]
     np.testing.assert_allclose(part.vertices, mesh.vertices, atol=1e-6)
     np.testing.assert_array_equal(part.faces, mesh.faces)
     assert part.vertex_colour is not None and part.normals is not None
     np.testing.assert_allclose(part.vertex_colour, mesh.colours, atol=1e-7)
     np.testing.assert_allclose(part.normals, mesh.normals, atol=1e-6)
-    found = trimesh.load_scene(tmp_path / "a.glb")
+    scene = trimesh.load_scene(tmp_path / "a.glb")
     x, y, z = mesh.vertices.T
     expected = np.stack([x, z, -y], axis=1)  # y up, and our -y in front
-    np.testing.assert_allclose(found.bounds[0], expected.min(0), atol=1e-6)
-    np.testing.assert_allclose(found.bounds[1], expected.max(0), atol=1e-6)
+    np.testing.assert_allclose(scene.bounds[0], expected.min(0), atol=1e-6)
+    np.testing.assert_allclose(scene.bounds[1], expected.max(0), atol=1e-6)
 
 
 class TestFaces:
@@ -221,12 +221,12 @@ def test_the_command_writes_both_kinds(tmp_path, capsys):
     field, glb, faces = (tmp_path / name for name in ("a.safetensors", "a.glb", "b"))
     save_field(field, solid_field(block))
     assert cli.main(["export", "mesh", str(field), "-o", str(glb)]) == 0
-    wanted = [[-0.5, -0.4, 0.2], [0.5, 0.4, 1.4]]
-    np.testing.assert_allclose(load_mesh(glb).bounds, wanted, atol=0.05)
+    expected = [[-0.5, -0.4, 0.2], [0.5, 0.4, 1.4]]
+    np.testing.assert_allclose(load_mesh(glb).bounds, expected, atol=0.05)
     capsys.readouterr()
     assert cli.main(["export", "faces", str(field), "-o", str(faces), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["size_m"] == pytest.approx([2, 1.6, 1.6])
+    document = json.loads(capsys.readouterr().out)
+    assert document["size_m"] == pytest.approx([2, 1.6, 1.6])
     names = {f"{name}.png" for name in meshes.CUBE_FACES} | {"faces.json"}
     assert {path.name for path in faces.iterdir()} == names
 
@@ -238,7 +238,7 @@ def test_cube_reads_its_pictures(tmp_path):
     mesh = Placement().cube(1.0, tmp_path)
     assert mesh.area == pytest.approx(6.0)
     np.testing.assert_array_equal(
-        mesh.parts[0].texture[[0, 0, -1, -1], [0, -1, 0, -1]], CORNERS.reshape(4, 3)
+        mesh.submeshes[0].texture[[0, 0, -1, -1], [0, -1, 0, -1]], CORNERS.reshape(4, 3)
     )
     (tmp_path / "nz.png").unlink()
     with pytest.raises(InputError, match=r"nz\.png: does not exist"):

@@ -81,7 +81,7 @@ def test_a_bar_updates_an_element_of_a_notebook(capsys, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("period_s", "done", "told"),
+    ("period_s", "done", "expected"),
     [
         # the first hundred were kept
         (10.0, range(100, 104), ["0:00", "0:30 left", "0:20 left", "0:10 left"]),
@@ -89,7 +89,7 @@ def test_a_bar_updates_an_element_of_a_notebook(capsys, monkeypatch):
     ],
 )
 def test_a_bar_tells_the_time_left_now_and_then(
-    capsys, monkeypatch, period_s, done, told
+    capsys, monkeypatch, period_s, done, expected
 ):
     monkeypatch.setenv("TTY_COMPATIBLE", "1")
     monkeypatch.setenv("COLUMNS", "60")
@@ -101,7 +101,7 @@ def test_a_bar_tells_the_time_left_now_and_then(
     _, *lines = capsys.readouterr().err.split("\r")
     assert all(len(line) == 59 for line in lines)
     clocks = [line.split("  ")[1] for line in lines]
-    assert told in (clocks, len(lines))
+    assert expected in (clocks, len(lines))
 
 
 def test_a_bar_refuses_what_nothing_reports():
@@ -124,6 +124,6 @@ def test_brackets_in_names_stay(capsys, monkeypatch, tmp_path, name):
     with StageBars() as bars:
         bars.show(name, 1, 1, name)
         bars.say(name)
-    told, progress = capsys.readouterr()
-    assert f"Run folder: {tmp_path / name}" in told.replace("\n", "")
-    assert told.count(name) == 4 and progress.count(name) == 3
+    printed, progress = capsys.readouterr()
+    assert f"Run folder: {tmp_path / name}" in printed.replace("\n", "")
+    assert printed.count(name) == 4 and progress.count(name) == 3

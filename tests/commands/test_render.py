@@ -57,9 +57,9 @@ def test_one_frame(run, tmp_path):
     assert layers[""].shape == (6, 8, 3)
     assert (metadata["spp"], metadata["seed"]) == ("2", "5")
     code, out, _ = run("scene.xml -o a.png --json")
-    told = json.loads(out)
-    assert (code, told["output"], told["channels"]) == (0, "a.png", [])
-    assert told["size_px"] == [scenes.WIDTH, scenes.HEIGHT]
+    document = json.loads(out)
+    assert (code, document["output"], document["channels"]) == (0, "a.png", [])
+    assert document["size_px"] == [scenes.WIDTH, scenes.HEIGHT]
     with Image.open("a.png") as image:
         assert (image.size, image.mode) == ((scenes.WIDTH, scenes.HEIGHT), "RGB")
     assert run("scene.xml -o a.exr --set spp=3")[0] == 0

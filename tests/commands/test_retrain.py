@@ -63,9 +63,9 @@ def retrain(*arguments: object) -> int:
     return cli.main([str(word) for word in words])
 
 
-def figures(about: dict) -> tuple[float, float]:
+def figures(document: dict) -> tuple[float, float]:
     """Return the mean errors without objects before and after."""
-    (row,) = about["table"][:1]
+    (row,) = document["table"][:1]
     before, after = (row[stage]["no_object"] for stage in ("before", "after"))
     return before["cross_track_mean_m"], after["cross_track_mean_m"]
 
@@ -74,17 +74,17 @@ def test_a_users_command_trains_a_users_policy(world, monkeypatch, capsys):
     monkeypatch.chdir(world)
     command = ["--command", COMMAND, "-o", "new.safetensors"]
     assert retrain(*command, "--json") == 0
-    told, shown = capsys.readouterr()
+    printed, shown = capsys.readouterr()
     assert shown.count("rms error") == 4
-    about = files.read_json(world / "new-retrain.json")
-    assert json.loads(told).items() >= about.items()
+    document = files.read_json(world / "new-retrain.json")
+    assert json.loads(printed).items() >= document.items()
     weights = world / "net.safetensors"
-    assert about["policy"] == {"file": weights.name, "sha256": files.sha256(weights)}
-    assert about["training"]["command"] == COMMAND
-    assert about["training"]["frames"] == {"round_0/surrogate": 64}
+    assert document["policy"] == {"file": weights.name, "sha256": files.sha256(weights)}
+    assert document["training"]["command"] == COMMAND
+    assert document["training"]["frames"] == {"round_0/surrogate": 64}
     old, new = (files.read_safetensors(world / n)[0] for n in (weights, command[-1]))
     assert all(np.abs(new[name] - old[name]).max() > 0 for name in old)
-    before, after = figures(about)
+    before, after = figures(document)
     assert before != after
     # some frames are of drives of the attacked policy, which begin beside the lane
     frames = nf.frames(world / "data/round_0")
@@ -95,10 +95,10 @@ def test_a_users_command_trains_a_users_policy(world, monkeypatch, capsys):
     assert "rms error" not in capsys.readouterr().err
     assert (world / "data/trained/policy.safetensors").stat().st_mtime_ns == made
     (cell,) = (world / "data/adaptive/cells").iterdir()
-    (found,), (run,) = read_found([cell]), read_found([world / "run"])
-    assert found.scenario.policy.weights_file.file == world / "new.safetensors"
+    (adaptive,), (run,) = read_found([cell]), read_found([world / "run"])
+    assert adaptive.scenario.policy.weights_file.file == world / "new.safetensors"
     same = {"policy": run.scenario.policy}
-    assert found.scenario.model_copy(update=same).digest() == run.scenario.digest()
+    assert adaptive.scenario.model_copy(update=same).digest() == run.scenario.digest()
     assert cli.main(["report", "new-retrain.json", "-o", "page.html"]) == 0
     assert "Adaptive" in (world / "page.html").read_text()
 
@@ -109,9 +109,9 @@ def test_a_training_can_end_in_another_policy(world, monkeypatch, capsys):
     module = ["--module", "still_training.py:train", "--trust-code"]
     folder = files.make_folder(world / "results")
     assert retrain(*module, "-o", folder / "still.toml") == 0
-    about = files.read_json(folder / "still-retrain.json")
-    assert about["training"]["module"] == "still_training.py:train"
-    (found,) = read_found([world / "run"])
+    document = files.read_json(folder / "still-retrain.json")
+    assert document["training"]["module"] == "still_training.py:train"
+    (attack,) = read_found([world / "run"])
     drives = list((world / "data/old_after/drives").rglob("*.safetensors"))
     controls = [files.read_safetensors(path)[0]["controls"] for path in drives]
     held = [values for values in controls if (values == 0.125).all()]

@@ -69,7 +69,7 @@ def test_a_policy_is_tuned_on_old_and_new_frames(run, tmp_path, capsys):
     blocked = changed(run, tmp_path / "blocked", ("-13.0, 3.4", "-13.0, 0.4"))
     frames = ["--frames", "surrogate", 64, "--exposures-ev", 0]
     assert retrain(tmp_path, run, blocked, *frames, "--json") == 0
-    told, err = capsys.readouterr()
+    printed, err = capsys.readouterr()
     assert "blocked: left out: an object stands" in err and "no --more" in err
     old = PilotNet.load(run.parent / "policy.safetensors")
     new = PilotNet.load(tmp_path / "new.safetensors")
@@ -77,11 +77,13 @@ def test_a_policy_is_tuned_on_old_and_new_frames(run, tmp_path, capsys):
     pairs = zip(new.parameters(), old.parameters(), strict=True)
     steps = [float((a - b).abs().max().detach()) for a, b in pairs]
     assert 0 < max(steps) < 0.01  # a training of its own would be far away
-    about = files.read_json(tmp_path / "new-retrain.json")
-    assert json.loads(told).items() >= about.items()
-    assert [item["label"] for item in about["runs"]] == ["run"]
-    assert list(about["left_out"]) == ["blocked"]
-    assert about["policy"]["sha256"] == files.sha256(run.parent / "policy.safetensors")
+    document = files.read_json(tmp_path / "new-retrain.json")
+    assert json.loads(printed).items() >= document.items()
+    assert [item["label"] for item in document["runs"]] == ["run"]
+    assert list(document["left_out"]) == ["blocked"]
+    assert document["policy"]["sha256"] == files.sha256(
+        run.parent / "policy.safetensors"
+    )
     record = files.read_json(tmp_path / "new.json")
     assert record["data"] == {"round_0/surrogate": 64}
     # other runs are other frames
@@ -91,12 +93,12 @@ def test_a_policy_is_tuned_on_old_and_new_frames(run, tmp_path, capsys):
     # old frames are trained on, too, and attacks driven that nothing was trained on
     other = tmp_path / "other"
     other.mkdir()
-    more = ["--more", tmp_path / "data", "--held-out", run]
-    assert retrain(other, near, *frames, *more) == 0
+    options = ["--more", tmp_path / "data", "--held-out", run]
+    assert retrain(other, near, *frames, *options) == 0
     check_table(files.read_json(other / "new-retrain.json"), other)
     record = files.read_json(other / "new.json")
     assert record["data"] == {"round_0/surrogate": 64, "earlier/surrogate": 64}
-    check_adaptive(other, near, *frames, *more)
+    check_adaptive(other, near, *frames, *options)
     page = other / "page.html"
     words = ["report", str(other / "new-retrain.json"), "-o", str(page), "--json"]
     assert cli.main(words) == 0
@@ -107,34 +109,34 @@ def check_adaptive(folder: Path, run: Path, *arguments) -> None:
     """The new policy is attacked later, and not trained again."""
     weights = (folder / "new.safetensors").read_bytes()
     assert retrain(folder, run, *arguments, "--adaptive") == 0
-    about = files.read_json(folder / "new-retrain.json")
+    document = files.read_json(folder / "new-retrain.json")
     assert (folder / "new.safetensors").read_bytes() == weights
-    check_table(about, folder, "adaptive")
+    check_table(document, folder, "adaptive")
     (cell,) = (folder / "data" / "adaptive" / "cells").iterdir()
     assert (cell / "_complete").exists()
-    (found,), (old,) = read_found([cell]), read_found([run])
-    assert found.scenario.policy.file.file == folder / "new.safetensors"
+    (adaptive,), (old,) = read_found([cell]), read_found([run])
+    assert adaptive.scenario.policy.file.file == folder / "new.safetensors"
     same = {"policy": old.scenario.policy}
-    assert found.scenario.model_copy(update=same).digest() == old.scenario.digest()
-    (anew,) = about["adaptive"]
-    assert anew["label"] == cell.name and anew["found_sha256"] == found.digest
+    assert adaptive.scenario.model_copy(update=same).digest() == old.scenario.digest()
+    (anew,) = document["adaptive"]
+    assert anew["label"] == cell.name and anew["found_sha256"] == adaptive.digest
     made = cell.stat().st_mtime_ns
     assert retrain(folder, run, *arguments, "--adaptive") == 0
     assert cell.stat().st_mtime_ns == made
-    assert files.read_json(folder / "new-retrain.json") == about
+    assert files.read_json(folder / "new-retrain.json") == document
 
 
-def check_table(about: dict, folder: Path, *more: str) -> None:
+def check_table(document: dict, folder: Path, *extra_groups: str) -> None:
     """Before and after are the drives of a transfer of each group by each policy."""
-    rows = about["table"]
-    assert [row["group"] for row in rows] == ["old", "held_out", *more]
-    assert [item["label"] for item in about["held_out"]] == ["run"]
+    rows = document["table"]
+    assert [row["group"] for row in rows] == ["old", "held_out", *extra_groups]
+    assert [item["label"] for item in document["held_out"]] == ["run"]
     for row in rows:
         for stage in ("before", "after"):
             is_later = row["group"] == "adaptive" and stage == "before"
             group = "old" if is_later else row["group"]
-            kept = folder / "data" / f"{group}_{stage}" / "transfer.json"
-            (column,) = files.read_json(kept)["columns"]
+            path = folder / "data" / f"{group}_{stage}" / "transfer.json"
+            (column,) = files.read_json(path)["columns"]
             assert row[stage] == column["cases"]
             assert row[stage]["attack"]["drives"] == 1
             clean, attacked = (
@@ -153,31 +155,31 @@ def test_workers_make_the_vehicle_of_a_runs_user(run, tmp_path, monkeypatch):
     vehicle = f"[vehicle]\n{CUSTOM}trust_code = true\n".replace('"rad"', '"rad/s"')
     custom = changed(run, tmp_path / "custom", ("[drive]", f"{vehicle}[drive]"))
     (custom / "car.py").write_text(CAR)
-    (found,) = read_found([custom])
+    (attack,) = read_found([custom])
     command = Retrain((custom,), tmp_path / "o", tmp_path / "d", exposures_ev=(0.0,))
-    place = command._place([found])
-    settings = command._settings(found.scenario.policy, place)
-    sent = pickle.dumps(command._sites(place, settings, found.scenario.vehicle))
+    place = command._place([attack])
+    settings = command._settings(attack.scenario.policy, place)
+    sent = pickle.dumps(command._sites(place, settings, attack.scenario.vehicle))
     for name in [name for name in sys.modules if name.startswith("mi_nerfattack_user")]:
         monkeypatch.delitem(sys.modules, name)
     for site in pickle.loads(sent):
         environment = site.open(site.typical())
-        environment.reset(found.route)
+        environment.reset(attack.route)
         environment.step(0.0)
-        moved = np.hypot(*(environment.state[:2] - found.route.points[0]))
+        moved = np.hypot(*(environment.state[:2] - attack.route.points[0]))
         assert moved == pytest.approx(0.6, rel=1e-3)  # 6 m/s, as only its file says
         environment.close()
 
 
 def test_the_expert_decides_what_can_be_driven(run, tmp_path):
-    (found,) = read_found([run])
-    driven = drive_expert(found)
+    (attack,) = read_found([run])
+    driven = drive_expert(attack)
     assert driven.trouble == ""
     # a box 3 m wide around y = 3.4 m, and a car 1.8 m wide within 0.3 m of y = 0
     assert driven.gap_m == pytest.approx(3.4 - 1.5 - 0.9, abs=0.3)
     late = changed(run, tmp_path / "late", ("[drive]", "[drive]\nlateral_sd_m = 5.0"))
-    (found,) = read_found([late])
-    assert "leaves its lane" in drive_expert(found).trouble
+    (attack,) = read_found([late])
+    assert "leaves its lane" in drive_expert(attack).trouble
 
 
 @pytest.mark.parametrize(
@@ -310,11 +312,11 @@ def test_frames_have_the_camera_and_the_vehicle_of_a_policys_file(
 def test_frames_come_from_the_place_of_a_scenario(preset):
     """Also if options name other objects, but not if they name another scene."""
     file, cube = PolicyFile.read(str(bundled("room.toml"))), (Path("mine"),)
-    kept = Train(Path("data"), preset=preset, object=cube)
-    place = kept._place(find_preset(preset), file)
+    command = Train(Path("data"), preset=preset, object=cube)
+    place = command._place(find_preset(preset), file)
     assert place.scene == bundled("room/scene.xml") and place.objects == cube
-    there = replace(kept, scene=Path("s.xml"), routes_file=Path("r.json"), object=())
-    place = there._place(find_preset(preset), file)
+    other = replace(command, scene=Path("s.xml"), routes_file=Path("r.json"), object=())
+    place = other._place(find_preset(preset), file)
     assert place.scene == Path("s.xml") and place.field is None and place.objects
 
 

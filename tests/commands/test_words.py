@@ -35,17 +35,17 @@ def test_the_help_of_a_command_is_short_and_its_output_is_called_o(words, monkey
     monkeypatch.setenv("COLUMNS", str(COLUMNS))
     with contextlib.redirect_stdout(io.StringIO()) as out:
         assert main([*words.split(), "--help"]) == 0
-    told = out.getvalue()
-    assert f"usage: mi-nerfattack {words}" in told
-    lines = [max(1, -(-len(line) // COLUMNS)) for line in told.splitlines()]
+    help_text = out.getvalue()
+    assert f"usage: mi-nerfattack {words}" in help_text
+    lines = [max(1, -(-len(line) // COLUMNS)) for line in help_text.splitlines()]
     assert sum(lines) <= MOST_LINES
-    assert "default: None" not in told and "None}" not in told
-    titles = re.findall(r"(?m)^[ ╭─│]*([a-z]+) options", told)
+    assert "default: None" not in help_text and "None}" not in help_text
+    titles = re.findall(r"(?m)^[ ╭─│]*([a-z]+) options", help_text)
     assert not {"where", "options", "against"} & set(titles)
     hints = get_type_hints(WORDS[words], include_extras=True)
     if "output" in hints:
         assert hints["output"] in (Path, Path | None)
-        assert re.search(r"-o \S+, --output ", told)
+        assert re.search(r"-o \S+, --output ", help_text)
 
 
 def options(kind: type) -> Iterator[tuple[str, Any]]:
@@ -55,8 +55,8 @@ def options(kind: type) -> Iterator[tuple[str, Any]]:
         hint, name = hints[item.name], item.name
         notes: list[Any] = []
         while get_origin(hint) is Annotated:
-            hint, *more = get_args(hint)
-            notes += more
+            hint, *metadata = get_args(hint)
+            notes += metadata
         if tyro.conf.Positional in notes:
             continue
         if dataclasses.is_dataclass(hint):
@@ -65,18 +65,18 @@ def options(kind: type) -> Iterator[tuple[str, Any]]:
         for note in notes:
             name = getattr(note, "name", None) or name
         if get_origin(hint) in (Union, types.UnionType):
-            given = [one for one in get_args(hint) if one is not type(None)]
-            hint = given[0] if len(given) == 1 else tuple(given)
+            members = [one for one in get_args(hint) if one is not type(None)]
+            hint = members[0] if len(members) == 1 else tuple(members)
         yield name, hint
 
 
 def test_one_word_has_one_type():
-    found: dict[str, dict[str, list[str]]] = {}
+    hints_by_name: dict[str, dict[str, list[str]]] = {}
     for words, kind in WORDS.items():
         for name, hint in options(kind):
-            found.setdefault(name, {}).setdefault(str(hint), []).append(words)
-    assert len(found) > 100
-    assert not {name: kinds for name, kinds in found.items() if len(kinds) > 1}
+            hints_by_name.setdefault(name, {}).setdefault(str(hint), []).append(words)
+    assert len(hints_by_name) > 100
+    assert not {name: kinds for name, kinds in hints_by_name.items() if len(kinds) > 1}
 
 
 def test_flags_say_what_they_do_when_they_are_given():

@@ -118,8 +118,8 @@ def test_texels_lie_where_their_point_is_looked_up(rng):
     painted, baked = own[atlas.triangles], atlas.interpolate(corners)
     weights = np.concatenate([rng.dirichlet(np.ones(3), 60), np.eye(3)])
     for triangle, colour, uv in zip(corners, own, atlas.uv, strict=True):
-        found = lookup(atlas.image(painted), weights @ uv)
-        np.testing.assert_allclose(found, [colour] * len(found), atol=1e-4)
+        colours = lookup(atlas.image(painted), weights @ uv)
+        np.testing.assert_allclose(colours, [colour] * len(colours), atol=1e-4)
         miss = lookup(atlas.image(baked), weights @ uv) - weights @ triangle
         assert np.linalg.norm(miss, axis=1).max() < 0.02
 
@@ -146,9 +146,9 @@ class TestColours:
         mesh = box_file if own_mesh else None
         item = make_built_in(box_field(), Pose.identity(), mesh)
         for (axis, sign), colour in SIDES.items():
-            found = lookup(item.image, uv_at(item, side_points(rng, axis, sign)))
-            expected = np.tile(255 * np.array(colour), (len(found), 1))
-            np.testing.assert_allclose(found, expected, atol=2)
+            colours = lookup(item.image, uv_at(item, side_points(rng, axis, sign)))
+            expected = np.tile(255 * np.array(colour), (len(colours), 1))
+            np.testing.assert_allclose(colours, expected, atol=2)
 
     def test_triangles_face_outwards(self, box_file):
         item = make_built_in(box_field(), Pose.identity(), box_file)
@@ -195,10 +195,10 @@ def test_radiance_of_a_side(box_file):
     }
     lit = mi.load_dict(scene | built_in_shapes([item]), parallel=False)
     renderer = ViewRenderer(lit, from_fov(48, 48, 20.0))
-    seen = renderer.render(look_at([-4.0, 2.0, 1.2], [1.0, 2.0, 1.2]), 4, 0).rgb
+    radiance = renderer.render(look_at([-4.0, 2.0, 1.2], [1.0, 2.0, 1.2]), 4, 0).rgb
     albedo = srgb_to_linear_numpy(np.array(SIDES[1, 1]))
     expected = albedo * irradiance * cosine / np.pi
-    middle = seen[14:34, 14:34].reshape(-1, 3)
+    middle = radiance[14:34, 14:34].reshape(-1, 3)
     # 2 of 255 steps at a slope of at most 2.28
     tolerance = 2 / 255 * 2.28 * irradiance * cosine / np.pi
     assert np.abs(middle - expected).max() < tolerance

@@ -53,13 +53,13 @@ def test_a_frame_is_the_frames_of_cameras_alone(name, tmp_path):
     environment, frame = drive(name, several(place), conditions)
     assert environment.camera == RIG.cameras[0] and environment.rig.size == (21, 8)
     first_env, first = drive(name, place, conditions)
-    for found, expected in (
+    for actual, expected in (
         (first_frame(frame, RIG.layout).image, first.image),
         (first_frame(frame, RIG.layout).depth, first.depth),
         (first_frame(frame, RIG.layout).light, first.light),
         (frame.camera_to_world, first.camera_to_world),
     ):
-        assert np.array_equal(found, expected)
+        assert np.array_equal(actual, expected)
     assert not frame.image[6:, :12].any() and np.isinf(frame.depth[6:, :12]).all()
     # the same place seen by the second camera alone, but for its random numbers
     second = place.with_rig(Rig.of_one(RIG.cameras[1], LEFT))
@@ -88,8 +88,8 @@ def test_a_frame_is_the_frames_of_cameras_alone(name, tmp_path):
 def test_the_surrogate_shows_what_a_loop_does(tmp_path):
     place = several(write_place(tmp_path))
     environment, frame = drive("surrogate", place, Conditions())
-    seen = environment.sensor.observe(to_state(environment.state[None]), 1)
-    image = np.round(255 * seen.image.numpy()[0]).astype(np.uint8)
+    observation = environment.sensor.observe(to_state(environment.state[None]), 1)
+    image = np.round(255 * observation.image.numpy()[0]).astype(np.uint8)
     assert np.array_equal(image, frame.image)
 
 

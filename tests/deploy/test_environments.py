@@ -119,11 +119,16 @@ def test_surrogate_shows_what_the_sensor_of_attacks_sees():
     assert frame.image.std() > 5
     assert np.isinf(frame.depth).any() and np.isfinite(frame.depth).any()
     layers = frame.layers(["ball"])
-    parts = ("scene", "ball", "background")
-    assert set(layers) == {"", "Z", *parts, *(f"{name}.Z" for name in parts)}
-    whole = sum(layers[name] for name in parts)
-    assert abs(whole - layers[""]).max() < 1e-6
-    assert min(layers[name][..., 3].max() for name in parts) > 0.1
+    layer_names = ("scene", "ball", "background")
+    assert set(layers) == {
+        "",
+        "Z",
+        *layer_names,
+        *(f"{name}.Z" for name in layer_names),
+    }
+    total = sum(layers[name] for name in layer_names)
+    assert abs(total - layers[""]).max() < 1e-6
+    assert min(layers[name][..., 3].max() for name in layer_names) > 0.1
     assert (linear_to_uint8(layers[""][..., :3]) == frame.image).mean() > 0.99
 
 
@@ -163,13 +168,13 @@ def test_a_camera_blurs_light_and_adds_noise_to_values(name, tmp_path):
     environment.reset(a_route(), None, 5)
     with nothing_compiled():
         for control in (0.4, -0.2, 0.3):
-            seen = environment.step(control)
+            expected = environment.step(control)
         environment.reset(a_route(), None, 5)
         for control in (0.4, -0.2):  # periods without a look
             environment.advance(control)
         frame = environment.step(0.3)
-    assert (frame.image == seen.image).all() and frame.image.max() > 20
-    assert (frame.camera_to_world == seen.camera_to_world).all()
+    assert (frame.image == expected.image).all() and frame.image.max() > 20
+    assert (frame.camera_to_world == expected.camera_to_world).all()
     environment.close()
 
 
@@ -248,7 +253,7 @@ def sky(scene, name="noon"):
 TIMED = '<scene version="3.0.0"><emitter type="sunsky"/></scene>'
 BUILT, NOISY = Conditions(built_in=(object(),)), Conditions(noise_sd=0.1)
 LEFT = Rig.of_one(CAMERA, CameraMount(yaw_deg=60.0), "left")
-HERE, NONE = {"recording": Path()}, Path("none.xml")
+RECORDED, NONE = {"recording": Path()}, Path("none.xml")
 test_refused = refusals(
     (step(0.0, begun=False), "'blank': step comes after reset"),
     (step(math.nan), "control: nan"),
@@ -266,11 +271,11 @@ test_refused = refusals(
     (made("surrogate", field=None), "'surrogate': .*field"),
     (made("replay"), "'replay': .*recording"),
     (made("surrogate", BUILT), "'surrogate': .*built-in"),
-    (made("replay", BUILT, **HERE), "'replay': .*built-in"),
+    (made("replay", BUILT, **RECORDED), "'replay': .*built-in"),
     (made("carla", NOISY), "'carla': .*blur_px"),
     (made("carla", others=LEFT), r"'carla': .* 2 \(camera, left\)"),
-    (made("replay", others=LEFT, **HERE), "'replay': takes one camera"),
-    (made("replay", NOISY, **HERE), "'replay': .*blur_px"),
+    (made("replay", others=LEFT, **RECORDED), "'replay': takes one camera"),
+    (made("replay", NOISY, **RECORDED), "'replay': .*blur_px"),
     (made("mitsuba", scene=NONE), "none.xml: does not exist"),
     (sky(WALL), "'noon' .*`sunsky`"),
     (sky(TIMED), "'noon': .*sun_dir"),

@@ -90,10 +90,10 @@ def test_relit_objects_stay_so(folder, composite):
     description["integrator"]["near"]["relit"] = True
     description["integrator"]["relit_samples"] = 4
     sensor = scene_sensor(walled.load(description), toy.MOUNT, ["near"])
-    seen = image(sensor)
+    expected = image(sensor)
     again = [PosedField(item.field, item.pose) for item in sensor.objects]
     for shown in (sensor.objects, again):
-        np.testing.assert_allclose(image(showing(sensor, shown)), seen, atol=1e-5)
+        np.testing.assert_allclose(image(showing(sensor, shown)), expected, atol=1e-5)
 
 
 def test_fields_of_emitters_are_no_objects(folder):
@@ -111,9 +111,9 @@ def test_fields_of_emitters_are_no_objects(folder):
         scene_sensor(scene, toy.MOUNT, ["near"])
     key = key_of(mi.traverse(scene), ".colour")
     sensor, state = SceneSensor(scene, toy.MOUNT, [key]), to_state(STATE)
-    found = sensor.observe(state, 0)
-    distances = measure(sensor, found, state)
-    layers = take_apart(sensor, found, distances.start)
+    observation = sensor.observe(state, 0)
+    distances = measure(sensor, observation, state)
+    layers = take_apart(sensor, observation, distances.start)
     assert layers.objects == [] and dr.all(layers.behind.opacity == 1)
     assert 0 < np.isfinite(distances.far.numpy()).sum() < distances.far.numpy().size
 
@@ -123,12 +123,12 @@ BALLS = {"type": "shapegroup", "ball": {"type": "sphere"}}
 INSTANCE = {"type": "instance", "group": {"type": "ref", "id": "balls"}}
 
 
-def walls(call, lens=None, crop=None, **more):
+def walls(call, lens=None, crop=None, **entries):
     def make(folder):
         walled.write_fields(folder)
         described = walled.scene_dict(folder, *[lens] * bool(lens))
         described["sensor"]["film"].update(crop or {})
-        return call(scene_sensor(walled.load(described | more), toy.MOUNT, ["near"]))
+        return call(scene_sensor(walled.load(described | entries), toy.MOUNT, ["near"]))
 
     return make
 
@@ -180,12 +180,15 @@ def test_without_objects_it_shows_the_rest(folder):
     objects = {name: integrator.pop(name) for name in ("far", "near")}
     fog_alone = dict(integrator)
     del integrator["scene"]
-    for parts, wanted in ((fog_alone, fog_alone), (integrator, integrator["behind"])):
-        full = {**description, "integrator": {**parts, **objects}}
+    for without_objects, expected in (
+        (fog_alone, fog_alone),
+        (integrator, integrator["behind"]),
+    ):
+        full = {**description, "integrator": {**without_objects, **objects}}
         sensor = showing(sensor_of(full), [])
         state = walled.close_loop(sensor).initial(STATES[:1])
         image = sensor.observe(state, 0).image.numpy()[0]
-        bare = walled.rendered({**description, "integrator": wanted}, STATES[0])
+        bare = walled.rendered({**description, "integrator": expected}, STATES[0])
         assert abs(image - linear_to_srgb_numpy(bare)).max() <= 1e-4 < image.std()
 
 
@@ -197,10 +200,10 @@ def test_detached_gradient_is_that_of_the_held_camera(folder, rng):
     description["sky"] = {"type": "constant", "radiance": 0.4}
     sensor = sensor_of(description)
     loop = walled.close_loop(sensor)
-    whole = Rollout(loop, StageSum(toy.square_error), 10, adjoint=Replay())
-    drive = whole.run(loop.initial(STATES))
-    held = replace(whole, camera_path=CameraPath(drive.trajectory.states))
-    gradients = [item.numpy() for item in whole.gradient(drive).textures]
+    rollout = Rollout(loop, StageSum(toy.square_error), 10, adjoint=Replay())
+    drive = rollout.run(loop.initial(STATES))
+    held = replace(rollout, camera_path=CameraPath(drive.trajectory.states))
+    gradients = [item.numpy() for item in rollout.gradient(drive).textures]
     base = [texture.numpy().copy() for texture in sensor.textures()]
     along = [rng.normal(size=item.shape) for item in base]
 
@@ -210,8 +213,8 @@ def test_detached_gradient_is_that_of_the_held_camera(folder, rng):
         return held.run(loop.initial(STATES)).value
 
     expected = (value(0.05) - value(-0.05)) / 0.1
-    found = sum((g * d).sum() for g, d in zip(gradients, along, strict=True))
-    assert found == pytest.approx(expected, 1e-3)
+    derivative = sum((g * d).sum() for g, d in zip(gradients, along, strict=True))
+    assert derivative == pytest.approx(expected, 1e-3)
 
 
 def test_the_scene_shows_what_the_sensor_wears(folder):
@@ -238,12 +241,12 @@ def test_from_above_an_object_is_where_it_stands(folder):
     posed = sensor.objects[1]
     middle = posed.placed.translation[:2]
     overhead = Overhead.covering(middle + [[-4.0, -3.0], [4.0, 3.0]], 0.0, 80)
-    seen = []
+    images = []
     for colour in (-4.0, 4.0):
         texture = np.full((sensor.fields[1].n_vertices, 3), colour, np.float32)
         sensor.fields[1].set_parameter("texture", texture)
-        seen.append(surrogate_above(sensor, overhead).astype(int))
-    changed = np.argwhere(abs(seen[1] - seen[0]).max(-1) > 20)[:, ::-1] + 0.5
+        images.append(surrogate_above(sensor, overhead).astype(int))
+    changed = np.argwhere(abs(images[1] - images[0]).max(-1) > 20)[:, ::-1] + 0.5
     low, high = posed.field.lower, posed.field.upper
     corners = np.array([[x[0], y[1], 0] for x in (low, high) for y in (low, high)])
     world = posed.placed.scale * corners @ posed.placed.rotation.T
@@ -283,10 +286,10 @@ def test_rays_of_a_pixel_are_those_of_a_larger_image(side):
     few = field_sensor(scene, shown, CAMERA, toy.MOUNT, spp=side**2)
     many = field_sensor(scene, shown, large, toy.MOUNT)
     state = to_state(STATE)
-    found, wanted = (sensor.observe(state, 0) for sensor in (few, many))
-    rows = wanted.linear.numpy().T.reshape(toy.HEIGHT, side, toy.WIDTH, side, 3)
+    actual, expected = (sensor.observe(state, 0) for sensor in (few, many))
+    rows = expected.linear.numpy().T.reshape(toy.HEIGHT, side, toy.WIDTH, side, 3)
     mean = rows.mean((1, 3)).reshape(-1, 3)
-    np.testing.assert_allclose(found.linear.numpy().T, mean, atol=2e-6)
+    np.testing.assert_allclose(actual.linear.numpy().T, mean, atol=2e-6)
 
     def gradient(sensor, observation, d_linear):
         """Differentiate a sum of linear pixels by the texture."""
@@ -297,13 +300,13 @@ def test_rays_of_a_pixel_are_those_of_a_larger_image(side):
         d_image = d_linear / slope.reshape(d_linear.shape)
         sensor.start_gradient()
         sensor.vjp(observation, state, mi.TensorXf(d_image[None].astype("f4")), False)
-        found = sensor.texture_gradients()[0].numpy()
+        by_texture = sensor.texture_gradients()[0].numpy()
         sensor.stop_gradient()
-        return found
+        return by_texture
 
     weights = np.random.default_rng(3).normal(size=(toy.HEIGHT, toy.WIDTH, 3))
     spread = weights.repeat(side, 0).repeat(side, 1) / side**2
-    ours, theirs = gradient(few, found, weights), gradient(many, wanted, spread)
+    ours, theirs = gradient(few, actual, weights), gradient(many, expected, spread)
     assert np.abs(theirs).max() > 1e-3
     np.testing.assert_allclose(ours, theirs, atol=1e-5 * np.abs(theirs).max())
 

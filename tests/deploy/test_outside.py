@@ -25,9 +25,9 @@ pytestmark = pytest.mark.usefixtures("variant")
 @pytest.fixture
 def server(monkeypatch) -> Server:
     """A stand-in server, whose client is what `import carla` finds."""
-    found = Server()
-    monkeypatch.setitem(sys.modules, "carla", found.api())
-    return found
+    stand_in = Server()
+    monkeypatch.setitem(sys.modules, "carla", stand_in.api())
+    return stand_in
 
 
 def test_carla_by_name(server):

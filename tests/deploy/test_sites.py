@@ -70,15 +70,15 @@ def test_the_version_of_what_simulates_counts_where_it_simulates(
     place, package = write_place(tmp_path), name.removesuffix("_gl")
     sites = PlaceSite(name, place), PlaceSite("mitsuba", place)
     before = [site.describe() for site in sites]
-    for found in ("99.0", "not installed"):
+    for release in ("99.0", "not installed"):
 
-        def version(asked: str, found=found) -> str:
-            if found[0].isdigit():
-                return found
+        def version(asked: str, release=release) -> str:
+            if release[0].isdigit():
+                return release
             raise importlib.metadata.PackageNotFoundError(asked)
 
         monkeypatch.setattr(importlib.metadata, "version", version)
-        assert sites[0].describe() == {**before[0], package: found}
+        assert sites[0].describe() == {**before[0], package: release}
         assert sites[1].describe() == before[1]
 
 

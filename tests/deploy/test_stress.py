@@ -42,12 +42,12 @@ def test_frames_and_controls_come_so_many_periods_late(frames, controls):
     around = LateFrames(LateControls(DroppedFrames(inside, 0.0), controls), frames)
     assert around.camera == inside.camera and around.name == inside.name
     for _ in range(2):
-        seen, states = run(around)
+        images, states = run(around)
         held = np.diff([state[2] for state in states]) / inside.period
         expected = [0.0] * controls + list(CONTROLS[: len(CONTROLS) - controls])
         np.testing.assert_allclose(held, expected, atol=1e-12)
         expected = [plain[max(0, k - frames)] for k in range(len(plain))]
-        np.testing.assert_array_equal(seen, expected)
+        np.testing.assert_array_equal(images, expected)
     around.show(["object"])
     assert inside.objects == ["object"] and not around.is_over
     around.reset(straight(), START)
@@ -68,29 +68,29 @@ test_what_is_refused = refusals(
 def test_a_lost_frame_repeats_the_last_one_and_the_car_goes_on():
     plain, plain_states = run(environment())
     lossy = DroppedFrames(environment(), 0.5)
-    seen, states = run(lossy)
+    images, states = run(lossy)
     np.testing.assert_array_equal(states, plain_states)
     lost = 0
-    for k in range(1, len(seen)):
-        if not np.array_equal(seen[k], plain[k]):
-            np.testing.assert_array_equal(seen[k], seen[k - 1])
+    for k in range(1, len(images)):
+        if not np.array_equal(images[k], plain[k]):
+            np.testing.assert_array_equal(images[k], images[k - 1])
             lost += 1
     assert 0 < lost < len(CONTROLS)
     # the seed of the drive decides which, whatever was driven before
-    np.testing.assert_array_equal(run(lossy)[0], seen)
-    assert any(not np.array_equal(run(lossy, s)[0], seen) for s in range(4, 9))
+    np.testing.assert_array_equal(run(lossy)[0], images)
+    assert any(not np.array_equal(run(lossy, s)[0], images) for s in range(4, 9))
     nothing, _ = run(DroppedFrames(environment(), 1.0))
     assert all(np.array_equal(item, plain[0]) for item in nothing)
 
 
-GIVEN = np.array([[0.1, -0.2, 0.3, 0.0, 0.4, 0.0], [0.0, 0.0, 0.0, 0.1, 0.2, 0.3]])
+OFFSETS = np.array([[0.1, -0.2, 0.3, 0.0, 0.4, 0.0], [0.0, 0.0, 0.0, 0.1, 0.2, 0.3]])
 
 
 def test_objects_move_on_the_ground_and_turn_about_the_vertical():
-    found = PoseError(placement_m=0.1, turn_deg=5.0).offsets(GIVEN, 7)
-    moved = found[:, :3] - GIVEN[:, :3]
+    offsets = PoseError(placement_m=0.1, turn_deg=5.0).offsets(OFFSETS, 7)
+    moved = offsets[:, :3] - OFFSETS[:, :3]
     assert (moved[:, :2] != 0).all() and (moved[:, 2] == 0).all()
-    own, new = (Rotation.from_rotvec(item[:, 3:]) for item in (GIVEN, found))
+    own, new = (Rotation.from_rotvec(item[:, 3:]) for item in (OFFSETS, offsets))
     turns = (new * own.inv()).as_rotvec()
     assert (abs(turns[:, 2]) > 1e-3).all()
     np.testing.assert_allclose(turns[:, :2], 0, atol=1e-12)
@@ -113,13 +113,13 @@ def test_the_spread_is_as_given():
 def test_each_error_is_drawn_by_the_seed_alone():
     """Whatever other errors and further objects there are; none changes nothing."""
     error, mount = PoseError(0.1, 5.0, 1.0), CameraMount()
-    found = error.offsets(GIVEN, 3)
-    np.testing.assert_array_equal(error.offsets(GIVEN, 3), found)
-    assert not np.array_equal(error.offsets(GIVEN, 4), found)
-    np.testing.assert_array_equal(error.offsets(GIVEN[:1], 3), found[:1])
-    alone = PoseError(placement_m=0.1).offsets(GIVEN, 3)
-    np.testing.assert_array_equal(alone[:, :3], found[:, :3])
+    offsets = error.offsets(OFFSETS, 3)
+    np.testing.assert_array_equal(error.offsets(OFFSETS, 3), offsets)
+    assert not np.array_equal(error.offsets(OFFSETS, 4), offsets)
+    np.testing.assert_array_equal(error.offsets(OFFSETS[:1], 3), offsets[:1])
+    alone = PoseError(placement_m=0.1).offsets(OFFSETS, 3)
+    np.testing.assert_array_equal(alone[:, :3], offsets[:, :3])
     assert error.mount(mount, 3) == error.mount(mount, 3)
-    assert PoseError().offsets(GIVEN, 3) is GIVEN
+    assert PoseError().offsets(OFFSETS, 3) is OFFSETS
     assert PoseError().mount(mount, 3) is mount
     assert not PoseError(pitch_deg=1.0).moves_objects

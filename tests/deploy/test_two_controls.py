@@ -107,11 +107,11 @@ def test_the_expert_steers_and_keeps_the_speed(kind):
 
 def test_controls_of_the_expert():
     states = np.array([[0.0, 0, 0, 1.0], [0, 0.5, 0, 5.0], [0, 0, 0, 30.0]])
-    found = expert(straight()).control(states)
-    np.testing.assert_allclose(found[:, 1], [3.0, 0.0, -8.0])
-    assert found[1, 0] < 0 and found[0, 0] == 0
+    controls = expert(straight()).control(states)
+    np.testing.assert_allclose(controls[:, 1], [3.0, 0.0, -8.0])
+    assert controls[1, 0] < 0 and controls[0, 0] == 0
     poses = expert(straight()).control(states[:, :3])
-    np.testing.assert_allclose(poses, np.c_[found[:, 0], np.zeros(3)])
+    np.testing.assert_allclose(poses, np.c_[controls[:, 0], np.zeros(3)])
 
 
 def test_drives_record_both_controls(tmp_path):

@@ -48,8 +48,8 @@ def test_names_are_in_one_of_the_files_that_an_item_names(page):
         source = "\n".join(path.read_text("utf-8") for path in files)
         for owner, name in re.findall(FUNCTION, item):
             within = rf"^class {owner}\b(?:(?!^class ).)*?^    " if owner else r"^\s*"
-            found = re.search(rf"{within}def {name}\b", source, re.M | re.S)
-            assert found, f"{owner}.{name}: not in {files}"
+            match = re.search(rf"{within}def {name}\b", source, re.M | re.S)
+            assert match, f"{owner}.{name}: not in {files}"
         for name in {*re.findall(CLASS_OR_CONSTANT, item)} - NO_CODE:
             assert re.search(rf"\b{name}\b", source), f"{name}: not in {files}"
 
@@ -102,14 +102,14 @@ TESTS = sorted({name for name in NAMED if "::" in name})
 
 @cache
 def collected(path: Path) -> set[str]:
-    found = set()
+    names = set()
     for node in ast.parse(path.read_text("utf-8")).body:
         if isinstance(node, ast.ClassDef) and node.name.startswith("Test"):
             methods = (item for item in node.body if isinstance(item, ast.FunctionDef))
-            found |= {f"{node.name}::{item.name}" for item in methods}
+            names |= {f"{node.name}::{item.name}" for item in methods}
         elif isinstance(node, ast.FunctionDef):
-            found.add(node.name)
-    return {name for name in found if name.rpartition("::")[2].startswith("test_")}
+            names.add(node.name)
+    return {name for name in names if name.rpartition("::")[2].startswith("test_")}
 
 
 @pytest.mark.parametrize("name", TESTS)

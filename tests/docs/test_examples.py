@@ -41,7 +41,7 @@ def printed(name: str, folder: Path) -> list[float]:
     """Run an example in a folder; return the last number of each line printed."""
     lines = run(folder, DOCS / f"examples/{name}.py")
     numbers = [re.findall(r"-?\d+\.\d+", line) for line in lines]
-    return [float(found[-1]) for found in numbers if found]
+    return [float(matches[-1]) for matches in numbers if matches]
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
@@ -195,8 +195,8 @@ def test_blocks_are_saved_run_and_left_out(tmp_path):
     (tmp_path / "page.md").write_text(PAGE)
     done = follow(tmp_path / "page.md", "--keep", tmp_path / "kept")
     assert done.returncode == 0, done.stdout + done.stderr
-    told = [line.split(": ", 1)[1].split()[0] for line in done.stdout.splitlines()]
-    assert told == "saved ran as long: skip: ran as".split()
+    reports = [line.split(": ", 1)[1].split()[0] for line in done.stdout.splitlines()]
+    assert reports == "saved ran as long: skip: ran as".split()
     assert [path.name for path in (tmp_path / "kept/page").iterdir()] == ["sizes.toml"]
     follow(tmp_path / "page.md", "--long", "--keep", tmp_path / "all")
     assert (tmp_path / "all/page/long").exists()

@@ -115,24 +115,24 @@ class Basis:
         return Proposal([coefficients])
 
 
-def search_for(made, asks: int, told: list[float]) -> list[float]:
+def search_for(made, asks: int, objectives: list[float]) -> list[float]:
     """Minimise the distance from a point; first repeat what another search was told."""
     for index in range(asks):
         (texture,) = made.ask().textures
-        if index >= len(told):
-            told.append(float(np.sum((texture - [0.5, -0.2, 0.1, 0.3]) ** 2)))
-        made.tell(told[index])
-    return told
+        if index >= len(objectives):
+            objectives.append(float(np.sum((texture - [0.5, -0.2, 0.1, 0.3]) ** 2)))
+        made.tell(objectives[index])
+    return objectives
 
 
 @pytest.mark.usefixtures("examples")
 def test_the_search_finds_a_minimum_and_continues_by_its_history():
     search = importlib.import_module("nf_examples.method").OnePlusOne
-    whole = search_for(search(Basis(), 0.2, 3), 200, [])
-    assert whole[0] == pytest.approx(0.25 + 0.04 + 0.01 + 0.09)  # the original texture
-    assert min(whole) < 1e-3 * whole[0]
+    full = search_for(search(Basis(), 0.2, 3), 200, [])
+    assert full[0] == pytest.approx(0.25 + 0.04 + 0.01 + 0.09)  # the original texture
+    assert min(full) < 1e-3 * full[0]
     half = search_for(search(Basis(), 0.2, 3), 100, [])
-    assert search_for(search(Basis(), 0.2, 3), 200, half) == whole
+    assert search_for(search(Basis(), 0.2, 3), 200, half) == full
 
 
 @pytest.mark.usefixtures("examples")
@@ -142,10 +142,10 @@ def test_fog_covers_with_distance(tmp_path):
     settings = {"density_per_m": 0.05}
     clear = make_environment("mitsuba", place, conditions).reset(route, seed=1)
     foggy = make_environment("foggy", place, conditions, settings).reset(route, seed=1)
-    seen = np.exp(-0.05 * clear.depth.astype(np.float64))[..., None]
-    expected = 190 + seen * (clear.image.astype(np.float64) - 190)
+    transmittance = np.exp(-0.05 * clear.depth.astype(np.float64))[..., None]
+    expected = 190 + transmittance * (clear.image.astype(np.float64) - 190)
     assert np.abs(foggy.image - expected).max() <= 0.51
-    assert seen.max() > 0.5 and (clear.depth == np.inf).any()
+    assert transmittance.max() > 0.5 and (clear.depth == np.inf).any()
 
 
 @pytest.mark.usefixtures("examples")
@@ -155,8 +155,8 @@ def test_play_holds_a_control_until_it_has_changed_enough():
     route = Route("line", 0, np.array([[0.0, 0.0], [30.0, 0.0]]))
     for environment in (loose, exact):
         environment.reset(route, np.zeros(3), 0)
-    given, taken = (0.05, 0.3, 0.25, 0.0, -0.5), (0.0, 0.2, 0.2, 0.1, -0.4)
-    for asked, held in zip(given, taken, strict=True):
+    controls, taken = (0.05, 0.3, 0.25, 0.0, -0.5), (0.0, 0.2, 0.2, 0.1, -0.4)
+    for asked, held in zip(controls, taken, strict=True):
         loose.step(asked)
         exact.step(held)
         assert np.allclose(loose.state, exact.state)

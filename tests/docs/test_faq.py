@@ -49,8 +49,10 @@ def is_printed(message: str, strings: tuple[str, ...]) -> bool:
         message: `...` is any text.
         strings: of :func:`literals`.
     """
-    parts = [part.strip(" :;,") for part in message.split("...")]
-    pattern = re.compile(".*".join(re.escape(part) for part in parts if part), re.S)
+    phrases = [phrase.strip(" :;,") for phrase in message.split("...")]
+    pattern = re.compile(
+        ".*".join(re.escape(phrase) for phrase in phrases if phrase), re.S
+    )
     return any(pattern.search(string) for string in strings)
 
 
@@ -82,7 +84,7 @@ told = "no " f"file {name!r}"
 
 
 @pytest.mark.parametrize(
-    ("message", "found"),
+    ("message", "expected"),
     [
         ("...: ... rows, at least 2 are needed", True),
         ("... at least ... needed", True),
@@ -93,5 +95,5 @@ told = "no " f"file {name!r}"
         ("The docstring is not printed.", False),
     ],
 )
-def test_messages_are_found_in_strings_that_expressions_interrupt(message, found):
-    assert is_printed(message, tuple(literals(SOURCE))) is found
+def test_messages_are_found_in_strings_that_expressions_interrupt(message, expected):
+    assert is_printed(message, tuple(literals(SOURCE))) is expected

@@ -131,8 +131,8 @@ def test_patches_of_two_resolutions_equal_their_rows(name, pixels):
     means = rows.groupby(["seed", "environment", "case"])["cross_track_mean_m"].mean()
     assert len(own) >= 2
     for seed, figures in own.items():
-        found = [means[seed, where, "attack"] for where in ("surrogate", "built_in")]
-        assert tuple(f"{mean:.3f}" for mean in found) == figures
+        errors = [means[seed, where, "attack"] for where in ("surrogate", "built_in")]
+        assert tuple(f"{mean:.3f}" for mean in errors) == figures
     if name == "flat_coarse":
         lit = rows[rows["environment"] == "built_in"]
         left, count = lit[lit["case"] == "attack"]["departed"].agg(["sum", "count"])
@@ -174,12 +174,12 @@ def test_the_table_of_coarse_colours_equals_its_rows():
     means = rows.groupby(by)["cross_track_mean_m"].mean()
     for route, vertices, *figures in shown:
         method = methods[vertices]
-        found = [means[route, method, where] for where in ("surrogate", "built_in")]
-        assert [f"{mean:.3f}" for mean in found] == figures
+        errors = [means[route, method, where] for where in ("surrogate", "built_in")]
+        assert [f"{mean:.3f}" for mean in errors] == figures
     shares = means.xs("built_in", level=2) / means.xs("surrogate", level=2)
-    kept = shares.map(math.log).groupby("method").mean().map(math.exp)
-    told = f"{kept['fine']:.2f} to {kept['coarse_16']:.2f} only"
-    assert told in " ".join(text.split())
+    ratios = shares.map(math.log).groupby("method").mean().map(math.exp)
+    sentence = f"{ratios['fine']:.2f} to {ratios['coarse_16']:.2f} only"
+    assert sentence in " ".join(text.split())
 
 
 def test_the_table_of_fits_equals_its_file():
@@ -194,7 +194,7 @@ def test_the_table_of_attacks_equals_its_file():
     text = page("attack_speed")
     rows = [results("attack")["sizes"][size] for size in ("200x66", "366x188")]
 
-    def told(key: str, to: str, unit: str) -> str:
+    def table_cells(key: str, to: str, unit: str) -> str:
         pairs = [(row[f"{key}_seconds"], row[f"{to}_seconds"]) for row in rows]
         if unit == "times":
             cells = (f"{1e3 * x:.0f}, {x / y:.1f} times" for x, y in pairs)
@@ -202,19 +202,19 @@ def test_the_table_of_attacks_equals_its_file():
             cells = (f"{1e3 * x:.0f}, {x / y:.2f} drives" for x, y in pairs)
         return " | ".join(cells)
 
-    kept, flat = "kept_backgrounds", "the same, objects as one level"
+    adjoint, flat = "kept_backgrounds", "the same, objects as one level"
     for name, key, to in (
-        (f"iteration, `{kept}`", kept, "rollout"),
+        (f"iteration, `{adjoint}`", adjoint, "rollout"),
         (flat, "one_level", "rollout"),
         ("iteration, `replay`", "replay", "rollout"),
-        (f"iteration in bricks, `{kept}`", f"bricks_{kept}", "bricks_rollout"),
+        (f"iteration in bricks, `{adjoint}`", f"bricks_{adjoint}", "bricks_rollout"),
         (flat, "bricks_one_level", "bricks_rollout"),
     ):
-        assert f"| {name} | {told(key, to, 'drives')} |" in text
-    assert f"| PyTorch | {told('torch', kept, 'times')} |" in text
-    drives = [row[f"{kept}_seconds"] / row["rollout_seconds"] for row in rows]
+        assert f"| {name} | {table_cells(key, to, 'drives')} |" in text
+    assert f"| PyTorch | {table_cells('torch', adjoint, 'times')} |" in text
+    drives = [row[f"{adjoint}_seconds"] / row["rollout_seconds"] for row in rows]
     again = [row["replay_seconds"] / row["rollout_seconds"] for row in rows]
-    faster = [row["torch_seconds"] / row[f"{kept}_seconds"] for row in rows]
+    faster = [row["torch_seconds"] / row[f"{adjoint}_seconds"] for row in rows]
     words = " ".join(text.split())
     assert f"as long as {min(drives):.1f} to {max(drives):.1f} drives" in words
     assert f"{min(faster):.0f} to {max(faster):.0f} times as fast" in words

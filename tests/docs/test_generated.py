@@ -42,8 +42,8 @@ def test_every_plugin_has_a_section_with_its_parts(name):
 def cells(section: str) -> dict[str, str]:
     """Find the second cell of each row by the code spans of the first one."""
     text = (DOCS / "car/reference.md").read_text("utf-8")
-    (found,) = re.findall(rf"^## {section}\n(.*?)(?=^##+ |\Z)", text, re.M | re.S)
-    rows = re.findall(r"^\| (.*?) \| (.*?) \|", found, re.M)
+    (body,) = re.findall(rf"^## {section}\n(.*?)(?=^##+ |\Z)", text, re.M | re.S)
+    rows = re.findall(r"^\| (.*?) \| (.*?) \|", body, re.M)
     split = ((re.findall("`([^`]+)`", first), second) for first, second in rows)
     return {name: second for names, second in split for name in names}
 
@@ -79,18 +79,18 @@ def test_what_has_no_markdown_is_refused(tmp_path, monkeypatch, text):
 
 
 def test_files_replace_the_blocks_below_their_links():
-    link, kept = (
+    link, tail = (
         "[examples/wall.xml](examples/wall.xml):\n\n",
         "```\n\n```xml\nkept\n```\n",
     )
     wall = (DOCS / "examples/wall.xml").read_text("utf-8")
     assert (
-        generate.with_files(f"{link}```xml\nold\n{kept}")
-        == f"{link}```xml\n{wall}{kept}"
+        generate.with_files(f"{link}```xml\nold\n{tail}")
+        == f"{link}```xml\n{wall}{tail}"
     )
     part = link.replace(":\n\n", ", lines 2 to 3:\n\n")
     second_and_third = "".join(wall.splitlines(keepends=True)[1:3])
     assert (
-        generate.with_files(f"{part}```xml\nold\n{kept}")
-        == f"{part}```xml\n{second_and_third}{kept}"
+        generate.with_files(f"{part}```xml\nold\n{tail}")
+        == f"{part}```xml\n{second_and_third}{tail}"
     )

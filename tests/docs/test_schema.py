@@ -76,15 +76,15 @@ def allows(rule, value, defs) -> bool:
     names = sorted(rule.keys() & RULES.keys(), key=lambda name: name != "type")
     if not all(RULES[name](rule[name], value, defs) for name in names):
         return False
-    parts = []
+    children = []
     if isinstance(value, dict):
-        own, more = rule.get("properties", {}), rule.get("additionalProperties", True)
-        parts = [(own.get(key, more), item) for key, item in value.items()]
+        own, extra = rule.get("properties", {}), rule.get("additionalProperties", True)
+        children = [(own.get(key, extra), item) for key, item in value.items()]
     elif isinstance(value, list):
         first = rule.get("prefixItems", [])
         rules = [*first, *[rule.get("items", True)] * len(value)]
-        parts = list(zip(rules, value, strict=False))
-    return all(allows(part, item, defs) for part, item in parts)
+        children = list(zip(rules, value, strict=False))
+    return all(allows(subrule, item, defs) for subrule, item in children)
 
 
 def is_valid(name, values):
@@ -157,13 +157,13 @@ def listed(heading: str) -> set[tuple[str, str]]:
 
 def with_defaults(models: list[type[Section]]) -> set[tuple[str, str]]:
     """Return keys and defaults (JSON) of models; nothing for none."""
-    found: set[tuple[str, str]] = set()
+    defaults: set[tuple[str, str]] = set()
     for model in models:
         for key, default in model.defaults().items():
             if key not in ELSEWHERE:
                 none = default in (None, (), PydanticUndefined)
-                found.add((key, "" if none else json.dumps(default)))
-    return found
+                defaults.add((key, "" if none else json.dumps(default)))
+    return defaults
 
 
 @pytest.mark.parametrize("heading", LISTED)

@@ -24,8 +24,8 @@ PAGES = pages()
 
 @pytest.mark.parametrize("name", [*PAGES, *modules()])
 def test_text_keeps_the_voice(name):
-    found = findings_in(name, ROOT / name)
-    assert not found, "".join(f"\n{name}:{x.line}: {x.kind}: {x.text}" for x in found)
+    faults = findings_in(name, ROOT / name)
+    assert not faults, "".join(f"\n{name}:{x.line}: {x.kind}: {x.text}" for x in faults)
 
 
 # How-to pages are short; a page of reference may be as long as its tables need.
@@ -61,8 +61,8 @@ class Shown:
         def inner():
             """None."""
 '''
-    found = {(passage.line, passage.text) for passage in docstrings(source)}
-    assert found == {(1, "One."), (5, "Two."), (7, "Three."), (9, "Four.")}
+    passages = {(passage.line, passage.text) for passage in docstrings(source)}
+    assert passages == {(1, "One."), (5, "Two."), (7, "Three."), (9, "Four.")}
 
 
 def test_names_of_arguments_are_code_and_simple_tables_are_tables():
@@ -80,7 +80,7 @@ Args:
     size: told.
 """'''
     (passage,) = docstrings(source)
-    kinds = [(found.line, found.kind) for found in findings(passage.text)]
+    kinds = [(finding.line, finding.kind) for finding in findings(passage.text)]
     assert kinds == [(4, "phrase"), (14, "phrase")]
 
 
@@ -157,7 +157,7 @@ def test_phrases_are_found(bad, good):
 
 
 @pytest.mark.parametrize(
-    ("markdown", "found"),
+    ("markdown", "expected"),
     [
         ("It is `told`.\n\n```\ntold\n```\n\n| told |\n|---|", [(7, "phrase")]),
         ("x" * 100, []),
@@ -171,9 +171,9 @@ def test_phrases_are_found(bad, good):
         ("| 2 cores (AMD EPYC) |\n|---|", [(1, "machine")]),
     ],
 )
-def test_phrases_lines_and_machines_are_found_where_they_count(markdown, found):
-    assert kinds(markdown) == found
-    assert kinds(markdown, results=True) == [x for x in found if x[1] != "machine"]
+def test_phrases_lines_and_machines_are_found_where_they_count(markdown, expected):
+    assert kinds(markdown) == expected
+    assert kinds(markdown, results=True) == [x for x in expected if x[1] != "machine"]
 
 
 def test_findings_are_listed_with_page_and_line(tmp_path):

@@ -22,26 +22,26 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 def spec_of(run: int, environment: str = "surrogate", **decisive) -> DriveSpec:
-    about = environment, "line", "own", run, 10 + run, STEPS
+    labels = environment, "line", "own", run, 10 + run, STEPS
     identity = {"format": "mi_nerfattack drive 5", "run": f"{run}", **decisive}
-    return DriveSpec(*about, identity, how=0.1 * run)
+    return DriveSpec(*labels, identity, context=0.1 * run)
 
 
 def straight(spec: DriveSpec, shift: float) -> Drive:
     states = np.zeros((STEPS + 1, 3))
     states[:, 0] = np.arange(STEPS + 1)
     errors, times = np.full(STEPS, shift), np.arange(1.0, STEPS + 1)
-    about = spec.environment, spec.route, spec.case, spec.run, spec.seed
-    return Drive(*about, states, np.zeros(STEPS), errors, times)
+    labels = spec.environment, spec.route, spec.case, spec.run, spec.seed
+    return Drive(*labels, states, np.zeros(STEPS), errors, times)
 
 
 class Driver(AbstractDriver):
     def drive(self, spec, on_step):
-        if spec.how < 0:
+        if spec.context < 0:
             raise InputError("the policy diverged")
         for step in range(STEPS):
             on_step(step)
-        return straight(spec, spec.how)
+        return straight(spec, spec.context)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,16 +60,21 @@ def test_a_drive_is_found_by_what_decides_it(tmp_path):
     store, spec = Store(tmp_path), spec_of(2, "../mitsuba@noon+1EV")  # no path
     assert store.read(spec) is None and not store.has(spec)
     add(store, spec)
-    found = store.read(spec)
-    assert store.has(spec) and found is not None and found.wall_s == 1.5
-    assert (found.drive.cross_track_m == 0.5).all() and found.drive.seed == 12
+    stored = store.read(spec)
+    assert store.has(spec) and stored is not None and stored.wall_s == 1.5
+    assert (stored.drive.cross_track_m == 0.5).all() and stored.drive.seed == 12
     other = spec_of(2, spec.environment, policy="another")
     assert store.read(other) is None and not store.has(other)
     (path,) = drive_files(tmp_path)
     assert path == store.path(spec) and path.parent.parent == tmp_path
-    kept = read_drive(path)
-    assert (kept.route, kept.case, kept.run, kept.seed) == ("line", "own", 2, 12)
-    assert kept.environment == spec.environment
+    loaded = read_drive(path)
+    assert (loaded.route, loaded.case, loaded.run, loaded.seed) == (
+        "line",
+        "own",
+        2,
+        12,
+    )
+    assert loaded.environment == spec.environment
     add(store, other)
     assert len(read_drives(tmp_path)) == 2
     store.remove_others([other])
@@ -83,9 +88,9 @@ def test_all_rows_of_the_state_are_kept(tmp_path):
     drive = straight(spec, 0.5)
     states = np.hstack([drive.states, np.arange(8.0).reshape(4, 2)])
     store.add(spec, replace(drive, states=states), 1.0)
-    kept = read_drive(store.path(spec))
-    np.testing.assert_array_equal(kept.states, states)
-    np.testing.assert_array_equal(kept.poses, drive.states)
+    loaded = read_drive(store.path(spec))
+    np.testing.assert_array_equal(loaded.states, states)
+    np.testing.assert_array_equal(loaded.poses, drive.states)
 
 
 @pytest.mark.parametrize("damage", ["cut", "bit", "entries"])
@@ -111,12 +116,12 @@ def test_shared_drives_are_taken_over_and_given(tmp_path):
     spec = spec_of(0)
     add(one, spec)
     assert other.has(spec) and not drive_files(other.folder)
-    found = other.read(spec)
-    assert found is not None and (found.drive.cross_track_m == 0.5).all()
+    stored = other.read(spec)
+    assert stored is not None and (stored.drive.cross_track_m == 0.5).all()
     assert drive_files(other.folder) == [other.path(spec)]
     # a name of one's own for a drive that another run made
-    kept = other.read(replace(spec, environment="surrogate", case="own", seed=99))
-    assert kept is not None and kept.drive.seed == 99
+    relabelled = other.read(replace(spec, environment="surrogate", case="own", seed=99))
+    assert relabelled is not None and relabelled.drive.seed == 99
     other.path(spec).unlink()
     next(shared.rglob("*.safetensors")).write_bytes(b"no drive")
     with pytest.raises(InputError, match="shared"):
@@ -130,19 +135,23 @@ def test_missing_drives_are_done_once(tmp_path, workers):
     store = Store(tmp_path)
     add(store, specs[1], 9.0)
     work = Drives(store, ((specs[0], specs[1]), (specs[2],), (specs[3],)))
-    told, steps = [], []
-    found = run_drives(work, workers, lambda *both: steps.append(both), told.append)
-    shifts = [[item.drive.cross_track_m[0] for item in group] for group in found]
+    reports, steps = [], []
+    groups = run_drives(work, workers, lambda *both: steps.append(both), reports.append)
+    shifts = [[item.drive.cross_track_m[0] for item in group] for group in groups]
     assert shifts == [[0.0, 9.0], [0.2], [pytest.approx(0.3)]]
-    assert told[0] == {} and sorted(next(iter(each)) for each in told[1:]) == [0, 1, 2]
+    assert reports[0] == {} and sorted(next(iter(each)) for each in reports[1:]) == [
+        0,
+        1,
+        2,
+    ]
     assert steps[0] == (STEPS + 1, 4 * STEPS) and steps[-1] == (4 * STEPS, 4 * STEPS)
     if isinstance(workers, Processes):  # an interpreter with Dr.Jit
         assert peak_of_children_mb() >= max(before, 50)
     times = [path.stat().st_mtime_ns for path in drive_files(tmp_path)]
-    told.clear()
-    again = run_drives(work, workers, on_groups=told.append)
+    reports.clear()
+    again = run_drives(work, workers, on_groups=reports.append)
     assert [path.stat().st_mtime_ns for path in drive_files(tmp_path)] == times
-    assert len(told) == 1 and len(told[0]) == len(again) == 3
+    assert len(reports) == 1 and len(reports[0]) == len(again) == 3
 
 
 class Refusing(Drives):
@@ -152,26 +161,26 @@ class Refusing(Drives):
 
 class Losing(Drives):
     def drive(self, driver, spec, on_step):
-        found = super().drive(driver, spec, on_step)
+        outcome = super().drive(driver, spec, on_step)
         if spec.run == 2:
             self.store.path(spec).unlink()
-        return found
+        return outcome
 
 
 @pytest.mark.parametrize(
-    ("kind", "how", "told", "kept"),
+    ("kind", "shift", "match", "runs"),
     [
         (Drives, -1.0, "the policy diverged", [0]),  # and leaves those before
         (Refusing, 0.1, "3 drives without a place", []),  # before the first
         (Losing, 0.1, "own_0002-.*missing", [0, 1]),  # removed meanwhile
     ],
 )
-def test_drives_that_fail(tmp_path, kind, how, told, kept):
-    specs = spec_of(0), replace(spec_of(1), how=how), spec_of(2)
+def test_drives_that_fail(tmp_path, kind, shift, match, runs):
+    specs = spec_of(0), replace(spec_of(1), context=shift), spec_of(2)
     work = kind(Store(tmp_path), tuple((spec,) for spec in specs))
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=match):
         run_drives(work, InThisProcess())
-    assert [drive.run for drive in read_drives(tmp_path)] == kept
+    assert [drive.run for drive in read_drives(tmp_path)] == runs
 
 
 def test_versions_and_packages_of_the_environment_decide():

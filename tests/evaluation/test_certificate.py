@@ -117,9 +117,9 @@ def changes(rng, n: int, cosine: float, slope: float):
 
 def test_slope_and_cosine_are_those_of_the_gradients():
     rng = np.random.default_rng(2)
-    found = agreement(*changes(rng, 20_000, 0.8, 0.7))
-    assert found.cosine == pytest.approx(0.8, abs=0.01)
-    assert found.slope == pytest.approx(0.7, abs=0.02)
+    estimate = agreement(*changes(rng, 20_000, 0.8, 0.7))
+    assert estimate.cosine == pytest.approx(0.8, abs=0.01)
+    assert estimate.slope == pytest.approx(0.7, abs=0.02)
     same = agreement(*changes(rng, 8, 1.0, 1.3))
     assert same.slope == pytest.approx(1.3) and same.cosine == pytest.approx(1.0)
     assert same.is_true
@@ -133,7 +133,7 @@ def test_intervals_of_slope_and_cosine_hold_the_truth():
     rng, repeats = np.random.default_rng(3), 1500
     held = np.zeros(2)
     for _ in range(repeats):
-        found = agreement(*changes(rng, 32, 0.6, 1.0))
-        pairs = (found.slope_ci95, 1.0), (found.cosine_ci95, 0.6)
+        estimate = agreement(*changes(rng, 32, 0.6, 1.0))
+        pairs = (estimate.slope_ci95, 1.0), (estimate.cosine_ci95, 0.6)
         held += [low <= truth <= high for (low, high), truth in pairs]
     assert (abs(held / repeats - 0.95) < 0.02).all(), held / repeats

@@ -48,14 +48,14 @@ class Counting(AbstractPolicy):
 
     def __init__(self, value: float = 0.0) -> None:
         self.value = value
-        self.seen: list[tuple[np.ndarray, int, int]] = []
+        self.inputs: list[tuple[np.ndarray, int, int]] = []
 
     def initial_memory(self, count):
         assert count == 1
         return (0,)
 
     def step(self, image, goal, memory, numbers=None):
-        self.seen.append((image.numpy().copy(), goal, memory[0]))
+        self.inputs.append((image.numpy().copy(), goal, memory[0]))
         return dr.opaque(mi.Float, self.value, 1), (memory[0] + 1,)
 
     def control(self, image, goal):
@@ -75,24 +75,24 @@ def test_a_straight_drive_beside_the_centre_has_a_known_error():
     """At 0.3 m and an angle, control 0: the error is 0.3 + v t sin(psi)."""
     environment, policy = surrogate(), Counting()
     pose = np.array([1.0, 0.3, 0.05])
-    found = drive(environment, policy, straight(), pose, 7, 20)
-    expected = 0.3 + 5.0 * found.time_s * math.sin(0.05)
-    np.testing.assert_allclose(found.cross_track_m, expected, atol=1e-9)
-    np.testing.assert_allclose(found.time_s, 0.1 * np.arange(1, 21))
-    np.testing.assert_allclose(found.states[0], pose)
+    driven = drive(environment, policy, straight(), pose, 7, 20)
+    expected = 0.3 + 5.0 * driven.time_s * math.sin(0.05)
+    np.testing.assert_allclose(driven.cross_track_m, expected, atol=1e-9)
+    np.testing.assert_allclose(driven.time_s, 0.1 * np.arange(1, 21))
+    np.testing.assert_allclose(driven.states[0], pose)
     assert environment.seeds == [7]
     # the memory grows step by step, the goal is the route's
-    assert [seen[1:] for seen in policy.seen] == [(0, step) for step in range(20)]
+    assert [row[1:] for row in policy.inputs] == [(0, step) for step in range(20)]
     # a heading rate of w for T seconds turns the car by w T
-    found = drive(surrogate(), Counting(0.5), straight(), np.zeros(3), 0, 10)
-    assert found.states[-1, 2] == pytest.approx(0.5)
-    np.testing.assert_allclose(found.controls, 0.5)
+    driven = drive(surrogate(), Counting(0.5), straight(), np.zeros(3), 0, 10)
+    assert driven.states[-1, 2] == pytest.approx(0.5)
+    np.testing.assert_allclose(driven.controls, 0.5)
 
 
 def test_the_policy_sees_srgb_in_the_unit_interval():
     environment, policy = surrogate(), Counting()
     drive(environment, policy, straight(), np.array([1.0, 0.3, 0.0]), 0, 1)
-    image = policy.seen[0][0]
+    image = policy.inputs[0][0]
     assert image.shape == (1, 4, 8, 3) and image.dtype == np.float32
     # levels 128 + 1 / 0.2, 128 + 0.3 / 0.2 and 128
     np.testing.assert_allclose(image[0, 2, 3], np.array([133, 130, 128]) / 255, 1e-6)
@@ -116,7 +116,7 @@ def test_starts_are_cut_and_depend_on_seed_route_and_run_alone():
 
 def test_objects_are_the_same_in_every_environment_and_keep_their_textures():
     grid, route, settings = small_grid(), straight(), EvaluateSettings(horizon=3)
-    around, seen = surroundings(route), []
+    around, positions = surroundings(route), []
     for name in ("surrogate", "mitsuba"):
         environment = surrogate(name)
         runs = [
@@ -127,14 +127,14 @@ def test_objects_are_the_same_in_every_environment_and_keep_their_textures():
             for run in range(2)
         ]
         assert [item.case for item in runs] == [NO_OBJECT] * 2 + [RANDOM] * 2
-        shown = environment.seen
+        shown = environment.shown
         assert not any(shown[:8]) and all(len(item) == 1 for item in shown[8:])
         assert environment.objects == []
-        seen.append([shown[8][0].pose.translation, shown[12][0].pose.translation])
+        positions.append([shown[8][0].pose.translation, shown[12][0].pose.translation])
         # clean and with objects from the same start
         np.testing.assert_array_equal(runs[0].states[0], runs[2].states[0])
-    np.testing.assert_array_equal(seen[0], seen[1])
-    assert not np.array_equal(seen[0][0], seen[0][1])
+    np.testing.assert_array_equal(positions[0], positions[1])
+    assert not np.array_equal(positions[0][0], positions[0][1])
     np.testing.assert_array_equal(grid.texture.numpy(), 0)
 
 
@@ -145,8 +145,8 @@ def test_the_card_counts_drives_that_left_the_lane():
         for run, y in enumerate([0.0, 0.8, -0.9, 0.8, 0.0])
     ]
     key = ("surrogate", "straight", "no_object")
-    found = make_card({key: drives}, {"straight": 0.85})
-    figures = found["surrogate"]["straight"]["no_object"]
+    card = make_card({key: drives}, {"straight": 0.85})
+    figures = card["surrogate"]["straight"]["no_object"]
     assert (figures["n"], figures["drives_departed"]) == (5, 1)
     assert figures["cross_track_mean_m"] == pytest.approx(2.5 / 5)
     assert figures["cross_track_max_m"] == pytest.approx(0.9)
@@ -180,15 +180,15 @@ def test_what_cannot_be_measured_is_told_before_the_first_drive(objects, change,
     routes, around = [straight(), short], surroundings(straight(), short)
     with pytest.raises(InputError, match=named):
         evaluate(policy, [surrogate()], routes, fields, around, settings)
-    assert not policy.seen
+    assert not policy.inputs
 
 
 def test_the_expert_drives_by_the_state():
     environment, route = surrogate(), straight()
     expert = ExpertPolicy(environment, expert_for("rad/s", route, 0.1))
-    found = drive(environment, expert, route, np.array([0, 0.5, 0.1]), 0, 60)
-    assert found.distance_m[0] > 0.5
-    assert found.distance_m[-20:].max() < 0.01
+    driven = drive(environment, expert, route, np.array([0, 0.5, 0.1]), 0, 60)
+    assert driven.distance_m[0] > 0.5
+    assert driven.distance_m[-20:].max() < 0.01
     with pytest.raises(InputError, match="no derivative"):
         expert.vjp(None, 0, None)
 

@@ -22,18 +22,18 @@ TOWN = ["--server", "127.0.0.1:2000/Town01", "--routes-file", "routes.json"]
 @pytest.fixture
 def server(tmp_path, monkeypatch) -> Server:
     """A stand-in that the command finds, and files of a policy and its routes."""
-    found = Server()
-    monkeypatch.setattr(carla_environment, "load_client", found.api)
+    stand_in = Server()
+    monkeypatch.setattr(carla_environment, "load_client", stand_in.api)
     monkeypatch.chdir(tmp_path)
     files.write_json("routes.json", {"straight": ROUTE})
     Path("still.py").write_text("def drive(image, goal, step):\n    return [0.0]\n")
-    return found
+    return stand_in
 
 
-def evaluate(*more: str) -> int:
+def evaluate(*arguments: str) -> int:
     start = ["evaluate", "still.py:drive", "--runs", "1"]
     start += ["--set", "policy.kind=callable", "--set", "policy.trust_code=true"]
-    return cli.main([*start, "--horizon", "3", "--environments", *more])
+    return cli.main([*start, "--horizon", "3", "--environments", *arguments])
 
 
 def test_a_town_is_driven_in_this_process_and_given_back(server, capsys):

@@ -106,8 +106,8 @@ def test_known_offset_in_depth_and_colour(offset):
     (route,) = offset.routes
     assert [at.arc_m for at in route.stations] == [0, 4, 8]
     shown = linear_to_srgb_numpy(sigmoid_to_linear(np.array([RAW])))[0]
-    wanted = linear_to_srgb_numpy(np.array([GLOW]))[0]
-    expected = -20 * np.log10(abs(shown - wanted))
+    glow = linear_to_srgb_numpy(np.array([GLOW]))[0]
+    expected = -20 * np.log10(abs(shown - glow))
     for at in route.stations:
         assert at.psnr_db == pytest.approx(expected, abs=0.02)
         assert at.ceiling_db > 80 and at.wrong == 0 and at.hazy == 0
@@ -149,9 +149,9 @@ def test_field_with_rings_of_holes_and_haze(place):
     comparison = compare_with_scene(field, *place, OPTIONS)
     (route,) = comparison.routes
     assert 0.1 < route.mean("holes") < 0.3
-    found = document(comparison)
-    assert found["routes"]["ahead"]["holes"] == route.mean("holes")
-    assert not found["good_enough"]
+    table = document(comparison)
+    assert table["routes"]["ahead"]["holes"] == route.mean("holes")
+    assert not table["good_enough"]
     (route,) = compare_with_scene(wall(WALL_X, 0.03), *place, OPTIONS).routes
     assert route.mean("hazy") == 1  # 1 - exp(-0.6) = 0.45 straight ahead
     assert 0 < route.mean("wrong") <= 1
@@ -235,8 +235,8 @@ def test_the_command_compares_a_field_with_its_scene(place, tmp_path, capsys):
     words = ["render", "compare", path, scene, "--routes-file", routes]
     small = ["--size", 24, 16, "--fov-deg", 30, "--spp", 2]
 
-    def compare(*more) -> int:
-        return main([str(word) for word in (*words, *small, *more)])
+    def compare(*options) -> int:
+        return main([str(word) for word in (*words, *small, *options)])
 
     assert compare("--json") == 0
     line = capsys.readouterr().out.splitlines()[-1]

@@ -61,8 +61,8 @@ def test_departure_begins_beyond_the_limit():
 def test_environments_of_your_own_come_after_ours():
     names = ("zoo", "mine", "mitsuba", "surrogate")
     drives = [make_drive([0.1], environment=name) for name in names]
-    found = metrics.summarise(drives, LANES)["straight"]
-    assert list(found) == ["surrogate", "mitsuba", "mine", "zoo"]
+    figures = metrics.summarise(drives, LANES)["straight"]
+    assert list(figures) == ["surrogate", "mitsuba", "mine", "zoo"]
 
 
 def test_sums_by_hand():
@@ -133,17 +133,17 @@ def test_objectives_are_averaged_and_one_that_is_missing_is_no_number():
     drives = [make_drive([0.1], run=run) for run in range(3)]
     costs = dict(zip(drives, (-3.0, -1.0, -5.0), strict=True))
 
-    def found():
+    def random_figures():
         [figures] = metrics.summarise(drives, LANES, costs=costs)["straight"].values()
         return figures["random"]
 
-    assert found()["objective"] == -3
-    assert [run["objective"] for run in found()["per_run"]] == [-3, -1, -5]
+    assert random_figures()["objective"] == -3
+    assert [run["objective"] for run in random_figures()["per_run"]] == [-3, -1, -5]
     costs[drives[1]] = None
-    assert found()["objective"] is None
-    assert [run["objective"] for run in found()["per_run"]] == [-3, None, -5]
+    assert random_figures()["objective"] is None
+    assert [run["objective"] for run in random_figures()["per_run"]] == [-3, None, -5]
     costs |= dict.fromkeys(drives)
-    assert found()["objective"] is None
+    assert random_figures()["objective"] is None
 
 
 def test_interval_covers_the_normal_one():

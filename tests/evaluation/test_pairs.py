@@ -50,29 +50,29 @@ def side(number: int, figure: str = ERROR, errors=None) -> pd.DataFrame:
 
 
 def test_effect_by_hand():
-    found = compare(side(0)[::-1], side(1), ERROR)
-    assert (found.attacks, found.drives, found.unpaired) == (4, 8, 0)
-    assert found.seeds == 2
-    assert found.one == pytest.approx(3.5 / 4)
-    assert found.other == pytest.approx(0.7 / 4)
-    assert found.difference == pytest.approx(2.8 / 4)
-    assert found.iqm == pytest.approx((0.4 + 0.6) / 2)  # without 0.2 and 1.6
-    assert found.ratio == pytest.approx(5)
+    effect = compare(side(0)[::-1], side(1), ERROR)
+    assert (effect.attacks, effect.drives, effect.unpaired) == (4, 8, 0)
+    assert effect.seeds == 2
+    assert effect.one == pytest.approx(3.5 / 4)
+    assert effect.other == pytest.approx(0.7 / 4)
+    assert effect.difference == pytest.approx(2.8 / 4)
+    assert effect.iqm == pytest.approx((0.4 + 0.6) / 2)  # without 0.2 and 1.6
+    assert effect.ratio == pytest.approx(5)
     # bend: 0.4 and 0.6, squares about their mean 0.02; lane: 0.2 and 1.6, 0.98; of
     # one degree of freedom each
-    assert found.spread == pytest.approx(math.sqrt((0.02 + 0.98) / 2))
+    assert effect.spread == pytest.approx(math.sqrt((0.02 + 0.98) / 2))
 
 
 def test_intervals_of_few_attacks_are_students_t():
     """Five differences -1 to 3, by the textbook; the ratio on its logarithm."""
     errors = {("bend", k): ([k + 1.0], [2.0]) for k in range(5)}
-    found = compare(side(0, errors=errors), side(1, errors=errors), ERROR)
+    effect = compare(side(0, errors=errors), side(1, errors=errors), ERROR)
     half = 2.7764451 * math.sqrt(2.5 / 5)  # t of 4 degrees of freedom, sd^2 = 2.5
-    assert found.difference_ci95 == pytest.approx([1 - half, 1 + half])
+    assert effect.difference_ci95 == pytest.approx([1 - half, 1 + half])
     left = np.log([(15 - k) / 8 for k in range(1, 6)])  # without each
     half = 2.7764451 * math.sqrt(4 / 5 * ((left - left.mean()) ** 2).sum())
     ends = [1.5 * math.exp(-half), 1.5 * math.exp(half)]
-    assert found.ratio_ci95 == pytest.approx(ends)
+    assert effect.ratio_ci95 == pytest.approx(ends)
 
 
 def test_looks_of_one_start_are_averaged_and_strays_left_out():
@@ -86,30 +86,30 @@ def test_looks_of_one_start_are_averaged_and_strays_left_out():
             for run, value in enumerate([0.1, 8.0, 0.3])
         )
     )
-    found = compare(attack, looks, ERROR)
-    assert (found.attacks, found.drives, found.unpaired) == (1, 1, 2)
-    assert (found.one, found.other) == (0.5, pytest.approx(0.2))
+    effect = compare(attack, looks, ERROR)
+    assert (effect.attacks, effect.drives, effect.unpaired) == (1, 1, 2)
+    assert (effect.one, effect.other) == (0.5, pytest.approx(0.2))
 
 
 @pytest.mark.parametrize("count", [1, 4])
 def test_few_attacks_have_no_intervals(count):
     errors = {("bend", k): ([0.4 + k, 0.6], [0.1, 0.1]) for k in range(count)}
     sides = side(0, errors=errors), side(1, errors=errors)
-    found, left = compare(*sides, ERROR), compare_departures(*sides, ERROR)
-    intervals = found.difference_ci95, found.iqm_ci95, found.ratio_ci95
+    effect, left = compare(*sides, ERROR), compare_departures(*sides, ERROR)
+    intervals = effect.difference_ci95, effect.iqm_ci95, effect.ratio_ci95
     assert intervals == (None, None, None)
     assert (left.one_ci95, left.other_ci95) == (None, None)
-    assert (found.spread is None) == (count == 1)
+    assert (effect.spread is None) == (count == 1)
 
 
 def test_equal_attacks_give_points_and_nothing_has_no_ratio():
     errors = {("bend", seed): ([0.75], [0.25]) for seed in range(5)}
-    found = compare(side(0, errors=errors), side(1, errors=errors), ERROR)
-    assert found.difference_ci95 == found.iqm_ci95 == [0.5, 0.5]
-    assert found.ratio_ci95 == [3, 3] and (found.spread, found.seeds) == (0, 5)
+    effect = compare(side(0, errors=errors), side(1, errors=errors), ERROR)
+    assert effect.difference_ci95 == effect.iqm_ci95 == [0.5, 0.5]
+    assert effect.ratio_ci95 == [3, 3] and (effect.spread, effect.seeds) == (0, 5)
     errors["bend", 4] = [0.5], [0.0]
-    found = compare(side(0, errors=errors), side(1, errors=errors), ERROR)
-    assert (found.ratio, found.ratio_ci95) == (None, None)
+    effect = compare(side(0, errors=errors), side(1, errors=errors), ERROR)
+    assert (effect.ratio, effect.ratio_ci95) == (None, None)
 
 
 def test_one_that_differs_does_not_tell_the_interval_of_the_quartiles():
@@ -134,13 +134,18 @@ def test_departures_by_hand():
     errors |= {("lane", 0): ([3.0], [1.0]), ("lane", 1): ([0.9], [0.9])}
     errors["lane", 2] = [0.0, 1.9], [0.0, 0.0]  # once, but not on average
     sides = side(0, OUT, errors), side(1, OUT, errors)
-    found = compare_departures(*sides)
-    assert (found.both, found.one, found.other, found.neither) == (1, 5, 0, 2)
-    assert found.p_value == pytest.approx(2 / 2**5)  # five of five, either way
+    departures = compare_departures(*sides)
+    assert (departures.both, departures.one, departures.other, departures.neither) == (
+        1,
+        5,
+        0,
+        2,
+    )
+    assert departures.p_value == pytest.approx(2 / 2**5)  # five of five, either way
     ends = scipy.stats.binomtest(6, 8).proportion_ci(method="wilson")
-    assert found.one_ci95 == pytest.approx(list(ends))
-    assert found.other_ci95[0] < 1 / 8 < found.other_ci95[1]
-    assert compare_departures(sides[1], sides[0]).p_value == found.p_value
+    assert departures.one_ci95 == pytest.approx(list(ends))
+    assert departures.other_ci95[0] < 1 / 8 < departures.other_ci95[1]
+    assert compare_departures(sides[1], sides[0]).p_value == departures.p_value
     assert compare_departures(sides[0], sides[0]).p_value is None  # none differ
     assert compare_departures(*sides, least=0.2).both == 7
 
@@ -148,8 +153,8 @@ def test_departures_by_hand():
 def test_a_run_gives_its_drives_with_their_starts():
     drives = [make_drive([0.1], case="own", run=k) for k in range(2)]
     drives += [make_drive([0.2 + 0.1 * k], case="random", run=k) for k in range(3)]
-    found = drives_of_run(make_document(drives))
-    own, random = (found[found["case"] == case] for case in ("own", "random"))
+    rows = drives_of_run(make_document(drives))
+    own, random = (rows[rows["case"] == case] for case in ("own", "random"))
     names = ["scenario", "seed", "environment", "run", "start", "drive_seed"]
     assert random[names].to_numpy().tolist() == [
         ["x", 7, "surrogate", 0, 0, 100],
@@ -157,7 +162,7 @@ def test_a_run_gives_its_drives_with_their_starts():
         ["x", 7, "surrogate", 2, 0, 102],
     ]
     assert random[ERROR].tolist() == pytest.approx([0.2, 0.3, 0.4])
-    assert own["start"].tolist() == [0, 1] and not found["departed"].any()
+    assert own["start"].tolist() == [0, 1] and not rows["departed"].any()
     effect = compare(random, own, ERROR)
     assert effect.difference == pytest.approx((0.2 + 0.2) / 2)
 
@@ -204,7 +209,7 @@ def drawn(rng: np.random.Generator, shape: tuple[int, int]):
 
 def coverage(count: int, repeats: int = 2000) -> list[tuple[float, float]]:
     """Return the share of t and of BCa intervals that hold the mean."""
-    found = []
+    shares = []
     for values, mean in drawn(np.random.default_rng(count), (repeats, count)):
         few = np.array([mean_interval(row, 0) for row in values])
         bca = [
@@ -216,8 +221,8 @@ def coverage(count: int, repeats: int = 2000) -> list[tuple[float, float]]:
             for k in (0, 1)
         )
         held = (few[:, 0] <= mean) & (mean <= few[:, 1]), (low <= mean) & (mean <= high)
-        found.append((float(held[0].mean()), float(held[1].mean())))
-    return found
+        shares.append((float(held[0].mean()), float(held[1].mean())))
+    return shares
 
 
 @pytest.mark.slow

@@ -94,11 +94,11 @@ def test_drives_that_end_early(tmp_path):
     """They count where more of them could change nothing."""
     path = tmp_path / "criteria.toml"
 
-    def judge(text: str, whole: bool, **figures: float) -> bool | None:
+    def judge(text: str, complete: bool, **figures: float) -> bool | None:
         path.write_text(text)
-        return read_criteria(path).judge(figures, whole)
+        return read_criteria(path).judge(figures, complete)
 
-    for word, seconds, whole, outcome in (
+    for word, seconds, complete, outcome in (
         ("at_least", 1.0, True, True),
         ("at_least", 0.9, True, False),
         ("at_least", 1.0, False, True),
@@ -109,7 +109,7 @@ def test_drives_that_end_early(tmp_path):
         ("at_most", 1.1, False, False),
     ):
         text = TEXT.replace("at_least", word)
-        assert judge(text, whole, wheel_out_s=seconds) is outcome
+        assert judge(text, complete, wheel_out_s=seconds) is outcome
     text = TEXT.replace("wheel_out_s", "cross_track_mean_m")
     assert judge(text, True, cross_track_mean_m=2.0) is True
     assert judge(text, False, cross_track_mean_m=2.0) is None

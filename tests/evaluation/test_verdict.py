@@ -240,8 +240,8 @@ def test_drives_that_differ_more_than_an_attack_adds(document):
 
 def test_seeds_that_differ_more_than_an_effect():
     """Differences 0.1 and 0.5: mean 0.3, standard deviation sqrt(0.08) = 0.28."""
-    about = {"scenario": "bend", "environment": "surrogate", "run": 0, "start": 0}
-    own = pd.DataFrame({"seed": [0, 1], "e": [0.0, 0.0]}).assign(case="own", **about)
+    columns = {"scenario": "bend", "environment": "surrogate", "run": 0, "start": 0}
+    own = pd.DataFrame({"seed": [0, 1], "e": [0.0, 0.0]}).assign(case="own", **columns)
     attack = own.assign(case="attack", e=[0.1, 0.5])
     assert list(noise_larger(compare(attack, own, "e"), "error")) == []
     attack["e"] = [-0.1, 0.5]  # 0.2, sqrt(0.18) = 0.42

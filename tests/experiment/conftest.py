@@ -22,7 +22,7 @@ goal = { kind = "integer", count = 3 }
 """
 #: The camera of the toy loop's policy.
 CAMERA = f"[camera]\nwidth = {toy.WIDTH}\nheight = {toy.HEIGHT}\n[drive]"
-_FOUND = {
+_CHANGES = {
     '[policy]\nfile = "policy.safetensors"\n': _POLICY,
     "[drive]": CAMERA,
     "max_iterations = 30": "max_iterations = 2",
@@ -58,12 +58,12 @@ def folder(tmp_path_factory):
 
 
 def leave_out_results(monkeypatch):
-    def only_numbers(output, done, effort, *more):
+    def only_numbers(output, done, effort, *arguments):
         cost = effort().model_dump()
         files.write_json(output / "metrics.json", {"cost": cost})
-        found = {"ignored_changes": done.ignored, "flags": done.flags}
-        found["curve"] = done.curve
-        return {"cost": cost, "drives": done.drives, **found}
+        metrics = {"ignored_changes": done.ignored, "flags": done.flags}
+        metrics["curve"] = done.curve
+        return {"cost": cost, "drives": done.drives, **metrics}
 
     monkeypatch.setattr(results, "write_results", only_numbers)
 
@@ -75,7 +75,7 @@ def no_results(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def whole(folder, tmp_path_factory):
+def uninterrupted(folder, tmp_path_factory):
     """The folder of a job that nothing interrupted, and what it returned."""
     output = tmp_path_factory.mktemp("whole") / "run"
     with pytest.MonkeyPatch.context() as patch:
@@ -85,7 +85,7 @@ def whole(folder, tmp_path_factory):
 
 def write_found(folder: Path) -> Path:
     """Write a scenario of which poses and textures are attacked; return its file."""
-    attack_jobs.write_scenario(folder, _FOUND)
+    attack_jobs.write_scenario(folder, _CHANGES)
     attack_jobs.make_dense(folder)
     (folder / "smooth.py").write_text("from support.worlds.loops import SmoothPolicy\n")
     path = folder / "scenario.toml"

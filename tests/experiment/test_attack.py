@@ -35,10 +35,10 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 @dataclass(frozen=True)
 class Finished:
-    """An attack by the command line: its folder, what it told, files it entered."""
+    """An attack by the command line: its folder, what it printed, files it entered."""
 
     output: Path
-    told: str
+    printed: str
     entered: set[Path]
 
 
@@ -49,8 +49,8 @@ def finished(scenario_folder, tmp_path_factory) -> Finished:
     scene = load_field(scenario_folder / "scene.safetensors")
     scene.info["fit.psnr_heldout_db"] = "23.99"
     save_field(scenario_folder / "scene.safetensors", scene)
-    told, profile = io.StringIO(), cProfile.Profile(builtins=False)
-    with redirect_stdout(told), profile:
+    printed, profile = io.StringIO(), cProfile.Profile(builtins=False)
+    with redirect_stdout(printed), profile:
         assert cli.main(["attack", path, "-o", str(output), "--workers", "1"]) == 0
     functions = (entry.code for entry in profile.getstats())
     entered = {
@@ -58,11 +58,11 @@ def finished(scenario_folder, tmp_path_factory) -> Finished:
         for code in functions
         if code.co_flags & inspect.CO_OPTIMIZED  # no module and no class
     }
-    return Finished(output, " ".join(told.getvalue().split()), entered)
+    return Finished(output, " ".join(printed.getvalue().split()), entered)
 
 
 def test_attack_writes_a_complete_run_folder(scenario_folder, finished):
-    output, told = finished.output, finished.told
+    output, printed = finished.output, finished.printed
     document = files.read_json(output / "metrics.json")
     validate(document)
     assert_counts(document)
@@ -72,7 +72,7 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, finished):
     for name in ("blurred field: ", "not converged: "):
         assert any(flag.startswith(name) for flag in document["flags"])
     sentences = [*document["flags"], *document["verdict"]]
-    assert sorted(sentences, key=told.index) == sentences  # flags first
+    assert sorted(sentences, key=printed.index) == sentences  # flags first
     shown = [
         read_layers(path)[0]["object"][..., 3].mean()
         for path in sorted(output.glob("frames/surrogate_own/*.exr"))
@@ -156,22 +156,22 @@ def test_attack_policy_returns_the_finished_run(scenario_folder, tmp_path):
 
 def test_evaluate_policy_returns_the_card(scenario_folder, tmp_path, capsys):
     scenario, reports = scenario_folder / "scenario.toml", []
-    how = {"environments": ("surrogate",), "runs": 2, "horizon": 3}
-    found = nf.evaluate_policy(
+    options = {"environments": ("surrogate",), "runs": 2, "horizon": 3}
+    evaluation = nf.evaluate_policy(
         scenario,
         tmp_path / "drives",
         progress=lambda *report: reports.append(report),
-        **how,
+        **options,
     )
     total = reports[-1][1]
     assert reports[-1] == (total, total)
-    figures = found.card["surrogate"]["line"]
+    figures = evaluation.card["surrogate"]["line"]
     assert figures["no_object"]["n"] == 2
     card = tmp_path / "card.json"
     words = "--environments surrogate --runs 2 --horizon 3 --workers 1".split()
     folder = ["--drives", str(tmp_path / "drives"), "-o", str(card)]
     assert cli.main(["evaluate", str(scenario), *words, *folder]) == 0
-    assert files.read_json(card) == found.card
+    assert files.read_json(card) == evaluation.card
     capsys.readouterr()
 
 
@@ -211,10 +211,10 @@ MOST, MOST_OUTER = 145, 44  # aims: fewer than 130 and 45
 
 def test_an_attack_enters_few_files(finished):
     """Which a reader of it must open."""
-    found = [
+    sources = [
         x for x in finished.entered if x.is_relative_to(ROOT) and x.suffix == ".py"
     ]
-    paths = [path.relative_to(ROOT) for path in found]  # without templates of pages
+    paths = [path.relative_to(ROOT) for path in sources]  # without templates of pages
     ours = [path for path in paths if path.parts[0] in ("mi_nerfattack", "plugins")]
     outer = sorted(str(path) for path in ours if path.parts[1] in OUTER)
     assert len(ours) <= MOST and len(outer) <= MOST_OUTER, outer

@@ -33,8 +33,8 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 def test_shares_are_parts_of_the_gradient():
-    along, rest = np.array([[1.0, 2.0], [-1.0, 6.0]]), np.zeros((2, 1, 3))
-    data = TimeAttribution(np.arange(2), rest, along, along, 0.85, ["a", "b"])
+    along, costates = np.array([[1.0, 2.0], [-1.0, 6.0]]), np.zeros((2, 1, 3))
+    data = TimeAttribution(np.arange(2), costates, along, along, 0.85, ["a", "b"])
     np.testing.assert_allclose(data.shares, [[0.125, 0.25], [-0.125, 0.75]])
     assert not dataclasses.replace(data, along=0 * along).shares.any()
 
@@ -90,22 +90,22 @@ def test_a_failure_is_taken_apart(tmp_path, monkeypatch):
     attack = GradientAttack(Rollout(loop, objective, 3), toy.ROUTE, initial)
     attack.measure()
     steps = []
-    found = attribute(attack, ["ball"], 0.85, steps.append)
+    attribution = attribute(attack, ["ball"], 0.85, steps.append)
     assert len(steps) == 9
-    times = found.times
+    times = attribution.times
     assert times.costates.shape == (3, 2, 3) and times.shares.shape == (3, 1)
     assert times.shares.sum() == pytest.approx(1, rel=1e-6)
-    square = (found.textures[0].astype(float) ** 2).sum()
+    square = (attribution.textures[0].astype(float) ** 2).sum()
     assert times.along.sum() == pytest.approx(square, rel=1e-4)
     # the last image steers the last period, whose heading no state follows
-    assert found.norms[-1, 0] == pytest.approx(0, abs=1e-12)
+    assert attribution.norms[-1, 0] == pytest.approx(0, abs=1e-12)
     np.testing.assert_allclose(times.time_s, toy.DT * np.array([1, 2, 3]))
     side = np.sign(times.cross_track_m[-1])
     np.testing.assert_allclose(
         times.costates[-1], [[0, side[0] / 2, 0], [0, side[1] / 2, 0]], atol=1e-12
     )
     figures = drawn(monkeypatch)
-    write_attribution(tmp_path, found, [grid])
+    write_attribution(tmp_path, attribution, [grid])
     data = files.read_json(tmp_path / "attribution.json")
     assert data["gradient_share"]["ball"] == times.shares[:, 0].tolist()
     costates, shares, errors = figures[0].axes

@@ -51,11 +51,11 @@ def solid(*at, name="box", scale=0.5):
     return standing.Solid.of(name, PosedField(homogeneous(2.0), pose))
 
 
-def told(findings, *patterns):
+def expect(findings, *patterns):
     """Check that there are findings as described, and no others."""
-    found, wanted = list(findings), [pattern for pattern in patterns if pattern]
-    assert len(found) == len(wanted), found
-    for pattern, line in zip(wanted, found, strict=True):
+    lines, expected = list(findings), [pattern for pattern in patterns if pattern]
+    assert len(lines) == len(expected), lines
+    for pattern, line in zip(expected, lines, strict=True):
         assert re.search(pattern, line), line
 
 
@@ -82,7 +82,7 @@ def test_points_fill_what_is_dense():
     ],
 )
 def test_object_on_the_lane(at, pattern):
-    told(standing.lane_findings([solid(*at)], LINE, 1.8, STILL), pattern)
+    expect(standing.lane_findings([solid(*at)], LINE, 1.8, STILL), pattern)
 
 
 @pytest.mark.parametrize(
@@ -100,13 +100,13 @@ def test_object_that_may_move_onto_the_lane(aside, freedom, nearest):
     """Turned by 45 degrees, the box reaches 0.207 m farther."""
     pattern = nearest and f"box may move onto the lane: .*limit_m .* {nearest}"
     item = solid(3.0, aside, 0.5)
-    told(standing.lane_findings([item], LINE, 1.8, freedom), pattern)
+    expect(standing.lane_findings([item], LINE, 1.8, freedom), pattern)
 
 
 def test_objects_in_one_another():
     items = [solid(x, 0.0, 0.0, name=name) for name, x in (("a", 0), ("b", 0.9))]
-    told(standing.meeting_findings(items), "a and b stand in one another: 1. %")
-    told(standing.meeting_findings([items[0], solid(1.02, 0.0, 0.0)]), None)
+    expect(standing.meeting_findings(items), "a and b stand in one another: 1. %")
+    expect(standing.meeting_findings([items[0], solid(1.02, 0.0, 0.0)]), None)
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +148,7 @@ def street():
     ],
 )
 def test_object_in_a_scene(street, at, pattern):
-    told(standing.scene_findings([solid(*at)], LINE, street, "s.xml"), pattern)
+    expect(standing.scene_findings([solid(*at)], LINE, street, "s.xml"), pattern)
 
 
 def test_a_room_that_is_a_cube_is_open(street):
@@ -156,8 +156,8 @@ def test_a_room_that_is_a_cube_is_open(street):
     del street
     room = {"type": "cube", "to_world": mi.ScalarTransform4f().scale([30, 6, 4])}
     scene = mi.load_dict({"type": "scene", "room": room})
-    told(standing.scene_findings([solid(0, 4, -3.5)], LINE, scene, "room"), None)
-    told(standing.scene_findings([solid(0, 6, -3.5)], LINE, scene, "room"), "a wall")
+    expect(standing.scene_findings([solid(0, 4, -3.5)], LINE, scene, "room"), None)
+    expect(standing.scene_findings([solid(0, 6, -3.5)], LINE, scene, "room"), "a wall")
 
 
 @pytest.mark.parametrize(
@@ -182,7 +182,7 @@ def test_route_and_ground(points, patterns):
     arc = arc_lengths(*DriveSection(horizon=40).stretch(route, 0.1))
     finders = ground_findings, wall_findings
     lines = [find(route, arc, scene, "s.xml") for find in finders]
-    told(itertools.chain(*lines), *patterns)
+    expect(itertools.chain(*lines), *patterns)
 
 
 def test_two_worlds_of_other_scale():
@@ -245,10 +245,10 @@ def test_what_drives_tell(folder, tmp_path):
         assert part in short
     # of other starts: the first is 0.52 m aside, the second 1.23 m; there is room for
     # 0.85, and nothing is attacked
-    far, seen = ("[drive]", "[drive]\nlateral_sd_m = 1.5"), []
+    far, stages = ("[drive]", "[drive]\nlateral_sd_m = 1.5"), []
     with pytest.raises(InputError, match="in surrogate, run 1, "):
-        job(folder, tmp_path / "run", far, lambda *line: seen.append(line[0])).run()
-    assert set(seen) == {"surrogate: own", "mitsuba: own"}
+        job(folder, tmp_path / "run", far, lambda *line: stages.append(line[0])).run()
+    assert set(stages) == {"surrogate: own", "mitsuba: own"}
     assert not contents(tmp_path)
 
 
@@ -268,26 +268,26 @@ def test_anyway_goes_on_and_the_run_remembers(folder, tmp_path, monkeypatch):
     before = contents(output)
     with pytest.raises(InputError, match="ball is in the air"):
         job(folder, output, higher).run(force=True)
-    kept = {"checkpoint.safetensors", "metrics.json"}
+    unchanged = {"checkpoint.safetensors", "metrics.json"}
     for path, raw in contents(output).items():
-        assert path.name not in kept or raw == before[path]
+        assert path.name not in unchanged or raw == before[path]
 
 
-def test_a_sound_scenario_has_no_flags(whole):
-    assert whole[1]["flags"] == []
+def test_a_sound_scenario_has_no_flags(uninterrupted):
+    assert uninterrupted[1]["flags"] == []
 
 
 def test_the_command_passes_its_options(scenario_folder, tmp_path, monkeypatch):
-    path, seen = str(scenario_folder / "scenario.toml"), []
+    path, calls = str(scenario_folder / "scenario.toml"), []
 
     def run(self, force, anyway):
-        seen.append((force, anyway))
+        calls.append((force, anyway))
         raise InputError("seen")
 
     monkeypatch.setattr(module.Job, "run_claimed", run)
     for extra in ([], ["--anyway"], ["--force"]):
         assert cli.main(["attack", path, "-o", str(tmp_path / "run"), *extra]) == 2
-    assert seen == [(False, False), (False, True), (True, False)]
+    assert calls == [(False, False), (False, True), (True, False)]
 
 
 def check(folder, capsys, *change, options=()):
@@ -300,10 +300,10 @@ def check(folder, capsys, *change, options=()):
 def test_a_sound_scenario(scenario_folder, capsys):
     """It is told what an attack costs, and how to begin one."""
     looks = "[baseline]\ntextures = 2\n[deployment]"
-    code, told, picture = check(scenario_folder, capsys, "[deployment]", looks)
-    assert code == 0, told.out
+    code, captured, picture = check(scenario_folder, capsys, "[deployment]", looks)
+    assert code == 0, captured.out
     assert files.read_image(picture).shape[1] == 1600
-    first, cost, *_ = told.out.splitlines()
+    first, cost, *_ = captured.out.splitlines()
     assert "80.0 m, 4 control periods of 0.1 s; objects: ball" in first
     # 4 periods of: 3 iterations and the attribution's 3, two frames each; 2 looks and
     # the best judged; 4 cases of 2 drives and the looks in both worlds
@@ -321,16 +321,16 @@ def test_the_next_command_can_be_given_as_it_is_told(scenario_folder, capsys):
     assert cli.main(["check", str(path), *options, "--set", "seed=9"]) == 0
     last = capsys.readouterr().out.splitlines()[-1]
     words = ["mi-nerfattack", "attack", str(path), "-o", "runs/my scene"]
-    told = shlex.split(last.removeprefix("next: "))
-    assert told == [*words, "--set", "seed=9"]
+    command = shlex.split(last.removeprefix("next: "))
+    assert command == [*words, "--set", "seed=9"]
 
 
 def test_a_wrong_scenario(scenario_folder, capsys):
     """It hangs in the air; the picture is there all the same."""
     aloft = "objects.0.position_m=[7.0, 4.2, 4.6]"
     options = ["--no-drives", "--json", "--set", aloft]
-    code, told, picture = check(scenario_folder, capsys, "", "", options=options)
-    document = json.loads(told.out)
+    code, captured, picture = check(scenario_folder, capsys, "", "", options=options)
+    document = json.loads(captured.out)
     assert code == 1 and picture.is_file() and document["cost"] is None
     (line,) = document["refused"]
     assert line.startswith("ball is in the air of deployment.xml")
@@ -340,9 +340,9 @@ def test_a_wrong_scenario(scenario_folder, capsys):
 def test_a_policy_whose_images_are_others(scenario_folder, capsys):
     """The error of a drive is a reason to refuse; the picture is there."""
     wide = "[camera]\nwidth = 40\nheight = 20\n[drive]"
-    code, told, picture = check(scenario_folder, capsys, "[drive]", wide)
+    code, captured, picture = check(scenario_folder, capsys, "[drive]", wide)
     assert code == 1 and picture.is_file()
-    assert "refused: " in told.out and "40" in told.out
+    assert "refused: " in captured.out and "40" in captured.out
 
 
 @pytest.mark.parametrize(
@@ -386,10 +386,10 @@ def test_a_policy_without_a_slope_is_told_and_ends_its_attack(
     (scenario_folder / "rounded.py").write_text(ROUNDED)
     change = 'file = "policy.safetensors"', 'file = "rounded.py:Rounded"'
     words = ["--set", "policy.trust_code=true"]
-    code, told, _ = check(
+    code, captured, _ = check(
         scenario_folder, capsys, *change, options=["--no-drives", *words]
     )
-    assert code == 0 and "control by the first image is exactly 0;" in told.out
+    assert code == 0 and "control by the first image is exactly 0;" in captured.out
     path, run = str(scenario_folder / "changed.toml"), tmp_path / "run"
     for iteration in (1, 2):  # the second time it goes on from the first iteration
         assert cli.main(["attack", path, "-o", str(run), "--anyway", *words]) == 2

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from mi_nerfattack.backend.arrays import allocated_bytes
-from mi_nerfattack.experiment.checks.cost import kept_mb
+from mi_nerfattack.experiment.checks.cost import backgrounds_mb
 from mi_nerfattack.rollout.adjoint import KeptBackgrounds
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.scenario.scenario import load_scenario
@@ -24,8 +24,8 @@ def test_the_memory_of_kept_frames_is_told(scenario_folder):
     world = build_world(scenario, scenario.build_policy())
     loop = world.loop(world.optimised)
     rollout = Rollout(loop, world.objective, 30, adjoint=KeptBackgrounds())
-    kept = rollout.run(loop.initial(world.initial[:1])).trajectory.kept
-    truth = sum(allocated_bytes(seen) for seen, _ in kept) / 1e6
-    assert kept_mb(world) == pytest.approx(truth * 24 / 30, rel=0.3)
+    tape = rollout.run(loop.initial(world.initial[:1])).trajectory.tape
+    truth = sum(allocated_bytes(record) for record, _ in tape) / 1e6
+    assert backgrounds_mb(world) == pytest.approx(truth * 24 / 30, rel=0.3)
     other, _ = load_scenario(path, settings=["attack.adjoint.kind=replay"])
-    assert kept_mb(replace(world, scenario=other)) == 0
+    assert backgrounds_mb(replace(world, scenario=other)) == 0

@@ -75,12 +75,12 @@ def with_recording(source, folder):
     return folder
 
 
-def test_the_surrogates_drives_are_those_of_the_environment(folder, whole):
+def test_the_surrogates_drives_are_those_of_the_environment(folder, uninterrupted):
     """Of the attack's loop, the registry's environment and the run folder, all bits."""
     scenario, _ = load_scenario(folder / "scenario.toml")
     policy = TorchPolicy(toy.SmoothPolicy())
     world = build_world(scenario, policy)
-    kept = {(d.environment, d.case, d.run): d for d in whole[1]["drives"]}
+    drives = {(d.environment, d.case, d.run): d for d in uninterrupted[1]["drives"]}
     camera, mount = scenario.camera.build()
     place = Place(
         scene=scenario.scene.deployment.file,
@@ -97,10 +97,10 @@ def test_the_surrogates_drives_are_those_of_the_environment(folder, whole):
     environment.show([PosedField(load_grid(item.field.file), item.pose)])
     loop = world.loop(world.surrogate)
     for run, start in enumerate(world.initial):
-        row = kept["surrogate", "own", run]
-        found = drive(environment, policy, world.route, start, 0, world.horizon)
-        assert np.array_equal(found.states, row.states)
-        assert np.array_equal(found.controls, row.controls)
+        row = drives["surrogate", "own", run]
+        driven = drive(environment, policy, world.route, start, 0, world.horizon)
+        assert np.array_equal(driven.states, row.states)
+        assert np.array_equal(driven.controls, row.controls)
         batch = simulate(loop, loop.initial(start), world.horizon)
         assert np.array_equal(batch.states_numpy()[0, :, :3], row.states)
 
@@ -117,8 +117,8 @@ def test_an_attack_in_every_environment(folder, tmp_path, monkeypatch):
     cases = dict.fromkeys(CASES, 2)
     environments = document["routes"]["line"]
     assert list(environments) == ["surrogate", "mujoco", "carla", "lit"]
-    for found in environments.values():
-        assert {case: figures["n"] for case, figures in found.items()} == cases
+    for environment in environments.values():
+        assert {case: figures["n"] for case, figures in environment.items()} == cases
     replayed = document["replay"]["tape"]
     assert replayed["frames"] == 2 and replayed["control_unit"] == "rad/s"
     assert set(replayed["cases"]) == set(CASES) - {"own"}
@@ -137,12 +137,12 @@ def test_an_attack_in_every_environment(folder, tmp_path, monkeypatch):
     shown = {image["alt"] for image in reader.images}
     assert "Change of control in the recording, tape" in shown
     # each environment was driven past the attacked object, of as many layers
-    for label, parts in (("mujoco", 6), ("carla", 6), ("tape", 6), ("lit", 2)):
+    for label, layer_count in (("mujoco", 6), ("carla", 6), ("tape", 6), ("lit", 2)):
         own, attacked = (
             read_layers(output / "frames" / f"{label}_{case}" / "0000.exr")[0]
             for case in ("own", "attack")
         )
-        assert len(attacked) == parts + 3, label  # the policy's input
+        assert len(attacked) == layer_count + 3, label  # the policy's input
         assert abs(own[""] - attacked[""]).max() > 0.02, label
     # finished, it opens nothing again but for the results
     again = job(folder, output, (TABLE, SEVERAL)).run()
@@ -162,9 +162,9 @@ def bricks(tmp_path):
     cells = np.ones((2, 2, 2), bool)
     divided = np.full(8, 2, np.uint8)
     words = rng.integers(0, 1 << 32, vertex_count(divided), np.uint32)
-    parts = Occupancy(cells), divided, words, Codes(-6.0, -2.0), np.zeros((2, 4, 3))
+    structure = Occupancy(cells), divided, words, Codes(-6.0, -2.0), np.zeros((2, 4, 3))
     box = field.lower, field.upper
-    save_field(folder / "b.st", BrickField(*box, *parts, field.step_m, field.cone))
+    save_field(folder / "b.st", BrickField(*box, *structure, field.step_m, field.cone))
     return folder
 
 
@@ -173,8 +173,8 @@ def test_iterations_see_bricks_and_drives_the_field(bricks, tmp_path):
     plain = job(bricks, tmp_path / "in_field", NAMED[::-1], frames=None)
     plain = plain.run(anyway=True)
     [cases], [expected] = (
-        [routes["surrogate"] for routes in found["routes"].values()]
-        for found in (document, plain)
+        [routes["surrogate"] for routes in metrics["routes"].values()]
+        for metrics in (document, plain)
     )
     assert cases["own"]["per_run"] == expected["own"]["per_run"]
     history, other = (
@@ -182,11 +182,11 @@ def test_iterations_see_bricks_and_drives_the_field(bricks, tmp_path):
         for name in ("in_bricks", "in_field")
     )
     assert history[0]["objective"] != other[0]["objective"]
-    found = document["bricks"]
-    assert found["file"] == "b.st" and "bricks" not in plain
-    assert found["cross_track_mean_m"] != found["field_cross_track_mean_m"]
+    figures = document["bricks"]
+    assert figures["file"] == "b.st" and "bricks" not in plain
+    assert figures["cross_track_mean_m"] != figures["field_cross_track_mean_m"]
     least = min(history, key=lambda record: record["objective"])
-    assert found["cross_track_mean_m"] == pytest.approx(
+    assert figures["cross_track_mean_m"] == pytest.approx(
         least["cross_track_mean_m"], rel=1e-4
     )
     assert document["cost"]["renders"] > plain["cost"]["renders"]
@@ -210,9 +210,9 @@ def test_iterations_march_one_level_and_drives_all(tmp_path, monkeypatch):
         documents[value] = run.run(anyway=True)
     assert marched["true"] > 0 and marched["false"] == 0
     near, exact = documents["true"], documents["false"]
-    told = near["one_level"]
-    exact_mean = pytest.approx(told["field_cross_track_mean_m"], rel=0.05)
-    assert told["cross_track_mean_m"] == exact_mean and "one_level" not in exact
+    figures = near["one_level"]
+    exact_mean = pytest.approx(figures["field_cross_track_mean_m"], rel=0.05)
+    assert figures["cross_track_mean_m"] == exact_mean and "one_level" not in exact
     [cases], [expected] = (
         [routes["surrogate"] for routes in document["routes"].values()]
         for document in (near, exact)
@@ -295,13 +295,13 @@ def test_a_verdict_says_that_an_attack_removed_the_braking(tmp_path):
     document = Job(scenario, text, policy, output, frames=None).run(anyway=True)
     name = {"name": "rail.py:keeps_going", "missing": {}}
     assert document["objective"] == name
-    told = {(d.environment, d.case, d.run): d for d in read_drives(output / "drives")}
+    drives = {(d.environment, d.case, d.run): d for d in read_drives(output / "drives")}
     for environment, cases in document["routes"]["line"].items():
         for case, figures in cases.items():
             costs = [run["objective"] for run in figures["per_run"]]
             assert figures["objective"] == pytest.approx(np.mean(costs))
             for run, cost in enumerate(costs):
-                speeds = told[environment, case, run].states[1:, 3]
+                speeds = drives[environment, case, run].states[1:, 3]
                 assert cost == pytest.approx(-speeds.sum(), abs=1e-9)
         own, attack = (cases[case]["objective"] for case in ("own", "attack"))
         none = cases["no_object"]["objective"]

@@ -52,8 +52,8 @@ def test_killed_attacks_end_as_one_that_was_not(tmp_path):
     scenario = write_scenario(tmp_path / "scenario") / "scenario.toml"
     words = "attack", str(scenario), "--anyway", "--pictures", "none", "--workers", "1"
     command = [*module_command("mi_nerfattack.cli"), *words, "-o"]
-    whole, drawn, kills, runs, in_files = tmp_path / "whole", random.Random(0), 0, 0, 0
-    subprocess.run([*command, str(whole)], check=True)
+    intact, drawn, kills, runs, in_files = tmp_path / "whole", random.Random(0), 0, 0, 0
+    subprocess.run([*command, str(intact)], check=True)
     start = time.monotonic()
     subprocess.run([*command, str(tmp_path / "again")], check=True)
     longest_s = time.monotonic() - start
@@ -69,7 +69,7 @@ def test_killed_attacks_end_as_one_that_was_not(tmp_path):
                 files.read_safetensors(path)
         subprocess.run(mine, check=True)
         for name in RESULTS:
-            assert (whole / name).read_bytes() == (output / name).read_bytes(), name
-        one, other = (files.read_json(p / "metrics.json") for p in (whole, output))
+            assert (intact / name).read_bytes() == (output / name).read_bytes(), name
+        one, other = (files.read_json(p / "metrics.json") for p in (intact, output))
         assert one["routes"] == other["routes"] and not partial(output)
     print(f"{kills} kills, {in_files} of them within a file, {runs} attacks")

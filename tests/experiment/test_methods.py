@@ -52,21 +52,21 @@ def test_searches_spend_their_frames_and_keep_the_best(
     assert looks.backward_multiple == 0  # six random looks cost as much
     texture = world.appearance().textures[0]
     assert not np.array_equal(texture, original.textures[0])
-    seen = attack.rollout.measure(attack.initial).value
-    assert seen == pytest.approx(min(objectives), rel=1e-5)
+    after = attack.rollout.measure(attack.initial).value
+    assert after == pytest.approx(min(objectives), rel=1e-5)
     work.run()
     assert (tmp_path / "run" / "metrics.json").is_file()
 
 
 def test_an_interrupted_search_goes_on(folder, tmp_path, no_results):
     change = (ITERATIONS, keys("cma_es"))
-    whole = job(folder, tmp_path / "whole", change).run()
+    uninterrupted = job(folder, tmp_path / "whole", change).run()
     output = tmp_path / "output"
     stage = "surrogate: optimisation", 9
     interrupt(folder, output, *stage, change=change)
     resumed = job(folder, output, change).run()
-    assert_same_drives(resumed["drives"], whole["drives"])
-    assert resumed["curve"] == whole["curve"]
+    assert_same_drives(resumed["drives"], uninterrupted["drives"])
+    assert resumed["curve"] == uninterrupted["curve"]
     assert resumed["curve"]["frames"] == [2, 4, 6, 8, 10, 12]
     # by force it goes on in no other scenario
     other = keys("cma_es", 14)
@@ -103,8 +103,8 @@ def test_a_policy_without_derivatives_is_attacked(scenario_folder, tmp_path, cap
         "    return 3 * (image[..., :99].mean((1, 2, 3)) - image.mean((1, 2, 3)))\n"
     )
     text = (scenario_folder / "scenario.toml").read_text()
-    found = 'kind = "callable"\nfile = "mine.py:drive"\ntrust_code = true'
-    text = re.sub(r"(?ms)^\[policy\]\n.*?(?=^\[)", f"[policy]\n{found}\n\n", text)
+    policy = 'kind = "callable"\nfile = "mine.py:drive"\ntrust_code = true'
+    text = re.sub(r"(?ms)^\[policy\]\n.*?(?=^\[)", f"[policy]\n{policy}\n\n", text)
     path, output = scenario_folder / "other.toml", tmp_path / "run"
     path.write_text(text)
     attack = ["attack", str(path), "-o", str(output)]

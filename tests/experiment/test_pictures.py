@@ -67,23 +67,23 @@ def kept_drive(run, environment, case):
 def test_a_frame_says_where_it_is_from(folder, run, environment, case):
     step = HORIZON - 1
     path = run / "frames" / f"{environment}_{case}" / f"{step:04d}.exr"
-    found, read = read_metadata(path), mi.Bitmap(str(path)).metadata()
-    assert {name: read[name] for name in found} == found  # as Mitsuba reads it
+    metadata, read = read_metadata(path), mi.Bitmap(str(path)).metadata()
+    assert {name: read[name] for name in metadata} == metadata  # as Mitsuba reads it
     words = {"scenario": "kill", "environment": environment, "case": case}
-    assert words.items() <= found.items() and "OpenCV" in found["pose_convention"]
-    told = {name: json.loads(v) for name, v in found.items() if v[0] in "[{-012345"}
-    assert told["versions"] == versions() and found["variant"] == mi.variant()
-    assert (told["run"], told["step"], told["spp"], told["seed"]) == (0, step, 1, 1)
-    kept = kept_drive(run, environment, case)
-    assert told["time_s"] == pytest.approx(kept["time_s"][step - 1])
-    assert told["state"] == pytest.approx(kept["states"][step])
-    assert told["control"] == kept["controls"][step]
-    assert told["cross_track_m"] == pytest.approx(kept["cross_track_m"][step - 1])
-    lens, (x, y, heading) = told["camera"], told["state"]
+    assert words.items() <= metadata.items() and "OpenCV" in metadata["pose_convention"]
+    frame = {name: json.loads(v) for name, v in metadata.items() if v[0] in "[{-012345"}
+    assert frame["versions"] == versions() and metadata["variant"] == mi.variant()
+    assert (frame["run"], frame["step"], frame["spp"], frame["seed"]) == (0, step, 1, 1)
+    stored = kept_drive(run, environment, case)
+    assert frame["time_s"] == pytest.approx(stored["time_s"][step - 1])
+    assert frame["state"] == pytest.approx(stored["states"][step])
+    assert frame["control"] == stored["controls"][step]
+    assert frame["cross_track_m"] == pytest.approx(stored["cross_track_m"][step - 1])
+    lens, (x, y, heading) = frame["camera"], frame["state"]
     assert (lens["width"], lens["height"], lens["cx"]) == (toy.WIDTH, toy.HEIGHT, 12)
     eye = [x + 0.5 * np.cos(heading), y + 0.5 * np.sin(heading), 1.4]
     assert np.array(lens["to_world"])[:3, 3] == pytest.approx(eye)
-    digests = told["digests"]
+    digests = frame["digests"]
     assert {"scenario", "scene.deployment", "policy.file"} < set(digests)
     content = (folder / "scene.safetensors").read_bytes()
     assert digests["scene.field"] == hashlib.sha256(content).hexdigest()
@@ -97,21 +97,23 @@ def test_a_frame_says_where_it_is_from(folder, run, environment, case):
 
 @pytest.mark.parametrize("case", CASES)
 def test_layers_add_up_in_half_precision(run, case):
-    parts = {"scene"} if case == "no_object" else {"scene", "object"}
+    layer_names = {"scene"} if case == "no_object" else {"scene", "object"}
     for environment in LABELS:
         folder = run / "frames" / f"{environment}_{case}"
         layers, _ = read_layers(folder / "0002.exr")
         shown = linear_to_uint8(layers[""][..., :3])
-        seen = files.read_image(folder / "0002.png")
-        assert np.abs(shown.astype(int) - seen).max() <= 1
-        assert ("object" in layers) == ("object" in parts)
+        picture = files.read_image(folder / "0002.png")
+        assert np.abs(shown.astype(int) - picture).max() <= 1
+        assert ("object" in layers) == ("object" in layer_names)
         if environment == "mitsuba" and case == "no_object":
             assert "scene" not in layers  # nothing to take apart
             continue
         half = environment == "surrogate"
-        found = [layers[name] for name in parts | ({"background"} if half else set())]
-        bound = HALF * (sum(np.abs(part) for part in found) + np.abs(layers[""]))
-        error = np.abs(sum(found) - layers[""])
+        summands = [
+            layers[name] for name in layer_names | ({"background"} if half else set())
+        ]
+        bound = HALF * (sum(np.abs(part) for part in summands) + np.abs(layers[""]))
+        error = np.abs(sum(summands) - layers[""])
         assert (error <= (bound if half else 1e-6) + 1e-7).all(), environment
 
 
@@ -164,12 +166,12 @@ def test_a_replay_of_the_frames_gives_the_controls(folder, run, environment, cas
     mount, period = scenario.camera.build()[1], scenario.vehicle.dt_s
     path = run / "frames" / f"{environment}_{case}"
     replay = ReplayEnvironment(open_recording(path, None, mount), mount, period)
-    policy, kept = TorchPolicy(toy.SmoothPolicy()), kept_drive(run, environment, case)
+    policy, stored = TorchPolicy(toy.SmoothPolicy()), kept_drive(run, environment, case)
     routes = scenario.scene.routes.file
     route = Route.from_file(routes, scenario.scene.route)
-    found = drive(replay, policy, route, kept["states"][0], 0, 100)
-    assert np.array_equal(found.controls, kept["controls"])
-    assert found.states == pytest.approx(kept["states"], abs=1e-6)
+    replayed = drive(replay, policy, route, stored["states"][0], 0, 100)
+    assert np.array_equal(replayed.controls, stored["controls"])
+    assert replayed.states == pytest.approx(stored["states"], abs=1e-6)
     depth = read_layers(path / "0001.exr")[0]["Z"]
     assert np.array_equal(replay.recording.depth(1), depth)
 
@@ -179,15 +181,15 @@ def test_videos_show_all_cases_side_by_side(run, label):
     """Each tile is the frame of its case and time, as far as H.264 keeps colours."""
     with av.open(str(run / "videos" / f"{label}.mp4")) as container:
         (stream,) = container.streams
-        found = [f.to_ndarray(format="rgb24") for f in container.decode(stream)]
-    assert len(found) == HORIZON + 1 and stream.average_rate == 10
+        pictures = [f.to_ndarray(format="rgb24") for f in container.decode(stream)]
+    assert len(pictures) == HORIZON + 1 and stream.average_rate == 10
     scale = TILE_PX // toy.WIDTH
     height, width = scale * toy.HEIGHT, scale * toy.WIDTH
     header = scale * toy.WIDTH // 22 + 2 * GAP_PX
     for index, case in enumerate(CASES):
         top = index // 2 * (header + height) + header
         left = GAP_PX + index % 2 * (width + GAP_PX)
-        for step, picture in enumerate(found):
+        for step, picture in enumerate(pictures):
             tile = picture[top : top + height, left : left + width]
             path = run / "frames" / f"{label}_{case}" / f"{step:04d}.png"
             centres = tile[scale // 2 :: scale, scale // 2 :: scale].astype(int)
@@ -200,8 +202,8 @@ def made(distances):
     count = len(distances)
     states = np.zeros((count + 1, 3))
     time_s = 0.1 * np.arange(1, count + 1)
-    about = "surrogate", "line", "own", 0, 0
-    return Drive(*about, states, np.zeros(count), np.array(distances), time_s)
+    labels = "surrogate", "line", "own", 0, 0
+    return Drive(*labels, states, np.zeros(count), np.array(distances), time_s)
 
 
 def test_frames_are_chosen():
@@ -227,8 +229,8 @@ def test_an_input_of_another_size_has_a_file_of_its_own(tmp_path):
     folder.add(7, 0.7, frame, layers, {"step": "7"}, half=True)
     folder.finish()
     assert set(read_layers(tmp_path / "0007.exr")[0]) == {"", "Z"}
-    found, metadata = read_layers(tmp_path / "0007_input.exr")
-    assert np.array_equal(found["input.0"], plane) and metadata["step"] == "7"
+    input_layers, metadata = read_layers(tmp_path / "0007_input.exr")
+    assert np.array_equal(input_layers["input.0"], plane) and metadata["step"] == "7"
     assert open_recording(tmp_path, None, CameraMount()).track.times == [0.7]
 
 

@@ -47,19 +47,19 @@ def test_moving_an_object_lowers_the_cost_within_its_limits():
 
 def test_both_at_once_go_on_from_their_tensors(single_thread):
     freedom = Freedom(0.3, 0.02)
-    whole, half = make_attack(freedom), make_attack(freedom)
+    uninterrupted, half = make_attack(freedom), make_attack(freedom)
     for _ in range(4):
-        whole.step()
+        uninterrupted.step()
     for _ in range(2):
         half.step()
     resumed = make_attack(freedom)
     resumed.load_tensors({key: value.copy() for key, value in half.tensors().items()})
     for _ in range(2):
         resumed.step()
-    assert resumed.history == whole.history
-    for name, value in whole.tensors().items():
+    assert resumed.history == uninterrupted.history
+    for name, value in uninterrupted.tensors().items():
         np.testing.assert_array_equal(resumed.tensors()[name], value, name)
-    assert whole.best_offsets.any()
+    assert uninterrupted.best_offsets.any()
     for wrong in (1.5, np.nan, np.inf, -np.inf):
         damaged = {key: value.copy() for key, value in half.tensors().items()}
         damaged["best.0"][0, 0] = wrong
@@ -107,7 +107,7 @@ def attack_of(folder, seed, keys=ROBUST):
 
 
 def test_the_seed_decides_all_that_is_drawn(folder):
-    found = []
+    drawn = []
     with deterministic():
         for seed in (4, 4, 5):
             attack, world = attack_of(folder, seed)
@@ -117,8 +117,8 @@ def test_the_seed_decides_all_that_is_drawn(folder):
             )
             assert world.surrogate.camera.seed == seed
             attack.step()
-            found.append([attack.tensors()["value.0"], np.array(attack.initial)])
-    for a, b, c in zip(*found, strict=True):
+            drawn.append([attack.tensors()["value.0"], np.array(attack.initial)])
+    for a, b, c in zip(*drawn, strict=True):
         assert np.array_equal(a, b) and not np.array_equal(a, c)
 
 
@@ -130,10 +130,10 @@ def test_each_part_changes_the_attack_and_nothing_changes_the_drives(folder):
         nominal = world.loop(world.surrogate)
         assert not nominal.disturbance and nominal.dynamics is world.motion.dynamics
         assert world.surrogate.camera.variation is None
-        seen = attack.rollout.measure(attack.initial)
-        mean = distances(world.route, seen).mean()
+        measured = attack.rollout.measure(attack.initial)
+        mean = distances(world.route, measured).mean()
         assert attack.measure_through(world.surrogate) == pytest.approx(mean)
-        assert world.renders == 2 * seen.trajectory.horizon
+        assert world.renders == 2 * measured.trajectory.horizon
         attack.step()
         gradients.append(attack.tensors()["first.0"])
     for i, one in enumerate(gradients):

@@ -61,13 +61,13 @@ def test_the_reach_of_a_linear_policy_is_exact(rng):
     signs = np.array([[1.0, 0.0], [-1.0, 0.0]])
     limits = low.astype(np.float32), (low + span).astype(np.float32)
     search = PixelSearch(starts=1, steps=1)
-    found, most = search.run(policy, 0, image.astype(np.float32), limits, signs)
+    extreme, most = search.run(policy, 0, image.astype(np.float32), limits, signs)
     steered = signs[:, :1, None, None] * weights[0]
     expected = (steered * low + np.maximum(steered, 0) * span).sum((1, 2, 3))
     assert most == pytest.approx(expected, rel=1e-5)
     outside = span == 0
-    np.testing.assert_allclose(found[outside], image[outside], rtol=1e-6)
-    assert (found >= limits[0]).all() and (found <= limits[1]).all()
+    np.testing.assert_allclose(extreme[outside], image[outside], rtol=1e-6)
+    assert (extreme >= limits[0]).all() and (extreme <= limits[1]).all()
 
 
 def test_other_starts_leave_the_nearest_maximum():
@@ -186,23 +186,23 @@ def test_a_table_of_places_goes_on(path, tmp_path, capsys):
 def test_a_row_of_another_scenario_is_replaced(path, tmp_path, capsys):
     output = tmp_path / "reach.csv"
     words = ["reach", str(path), "-o", str(output), "--json", "--set"]
-    found = []
+    digests = []
     for horizon in (2, 3):
         assert main([*words, f"drive.horizon={horizon}"]) == 0
         (row,) = json.loads(capsys.readouterr().out)["places"]
         assert row["frames"] == horizon and row["source"]
-        found.append(row["scenario"])
-    assert found[0] != found[1]
+        digests.append(row["scenario"])
+    assert digests[0] != digests[1]
     older = pd.read_csv(output).drop(columns=["scenario", "source"])
     older.assign(frames=99).to_csv(output, index=False)  # by a program before digests
     assert main([*words, "drive.horizon=3"]) == 0
     (row,) = json.loads(capsys.readouterr().out)["places"]
-    assert row["frames"] == 3 and row["scenario"] == found[1]
+    assert row["frames"] == 3 and row["scenario"] == digests[1]
 
 
 def test_what_belongs_to_the_other_kind_of_file_is_refused(path, tmp_path, capsys):
     grid = tmp_path / "grid.toml"
     grid.write_text(f'scenario = "{path}"\n')
-    for word, more in (("--only", ["no-place"]), ("--set", ["seed=1"])):
-        assert main(["reach", str(grid), word, *more]) == cli.EXIT_INPUT
+    for word, options in (("--only", ["no-place"]), ("--set", ["seed=1"])):
+        assert main(["reach", str(grid), word, *options]) == cli.EXIT_INPUT
         assert word[:5] in capsys.readouterr().err

@@ -36,9 +36,9 @@ LINE = Route("line", 0, np.array([[-20.0, 0], [60, 0]]))
 
 def course_of(route: Route, start: float = 0.0, length: float = LENGTH, **changes):
     camera, mount = from_fov(16, 8, 90.0), CameraMount()
-    about = {"control_unit": "rad/s", "wheelbase": 2.7} | changes
+    vehicle = {"control_unit": "rad/s", "wheelbase": 2.7} | changes
     lane = Lane(0.85, 1.75)
-    return Course(route, start, start + length, lane, camera, mount, PERIOD, **about)
+    return Course(route, start, start + length, lane, camera, mount, PERIOD, **vehicle)
 
 
 def beside(route: Route, arcs: np.ndarray, lateral: np.ndarray) -> np.ndarray:
@@ -56,8 +56,8 @@ def made(route: Route, case: str, most: float, run: int = 0) -> Drive:
     states = swerved(route, SPEED * PERIOD * np.arange(STEPS + 1), most)
     times = PERIOD * np.arange(1, STEPS + 1)
     controls, errors = np.diff(states[:, 2]) / PERIOD, route.cross_track_numpy(states)
-    about = "surrogate", route.name, case, run, run
-    return Drive(*about, states, controls, errors[1:], times)
+    labels = "surrogate", route.name, case, run, run
+    return Drive(*labels, states, controls, errors[1:], times)
 
 
 def write_drive(path, states, period: float, began: float = 1.8e9):
@@ -91,13 +91,13 @@ def recorded(folder, course: Course, states: np.ndarray, period: float):
 def test_a_drive_is_cut_to_the_stretch(route, begin, end, tmp_path):
     """At another speed; on the loop, the stretch comes after most of a lap."""
     course, states = course_of(route), swerved(route, np.arange(begin, end, 0.3), 1.5)
-    found = recorded(tmp_path, course, states, 0.3 / 4)
-    assert found.is_whole and found.drive.environment == "real"
-    assert found.drive.time_s[-1] == pytest.approx(LENGTH / 4, abs=0.15)
+    cut = recorded(tmp_path, course, states, 0.3 / 4)
+    assert cut.is_whole and cut.drive.environment == "real"
+    assert cut.drive.time_s[-1] == pytest.approx(LENGTH / 4, abs=0.15)
     of_run, places = made(route, "attack", 1.5), np.linspace(1.0, 11.0, 30)
     errors = [
         np.interp(places, course.arcs(drive.states[1:]), drive.cross_track_m)
-        for drive in (found.drive, of_run)
+        for drive in (cut.drive, of_run)
     ]
     # outside of a bend, the nearest place of the polygon is its vertex
     assert np.abs(np.subtract(*errors)).max() < 0.06
@@ -110,11 +110,11 @@ def test_a_drive_that_never_comes_back(tmp_path):
     away = np.maximum(way - 5, 0)
     x, y = np.minimum(way, 5) - 20 + np.cos(turn) * away, np.sin(turn) * away
     states = np.stack([x, y, np.where(away > 0, turn, 0)], 1)
-    found = recorded(tmp_path, course, states, 0.06)
-    driven = np.hypot(*np.diff(found.drive.states[:, :2], axis=0).T).sum()
-    assert driven == pytest.approx(LENGTH, abs=0.31) and found.is_whole
+    cut = recorded(tmp_path, course, states, 0.06)
+    driven = np.hypot(*np.diff(cut.drive.states[:, :2], axis=0).T).sum()
+    assert driven == pytest.approx(LENGTH, abs=0.31) and cut.is_whole
     reached = 5 + 7 * np.cos(turn)
-    assert found.coverage == pytest.approx(reached / LENGTH, abs=0.03)
+    assert cut.coverage == pytest.approx(reached / LENGTH, abs=0.03)
     assert not recorded(tmp_path, course, states[:30], 0.06).is_whole
 
 
@@ -122,9 +122,9 @@ def test_weaving_in_the_lane_is_no_way_along_it(tmp_path):
     """It stops early, though its path is as long as the stretch."""
     arcs = np.arange(0, 0.85 * LENGTH, 0.1)
     states = beside(LINE, arcs, 0.8 * np.sin(2 * arcs))
-    found = recorded(tmp_path, course_of(LINE), states, 0.02)
-    assert found.driven > 1 and found.coverage == pytest.approx(0.85, abs=0.02)
-    assert not found.is_whole
+    cut = recorded(tmp_path, course_of(LINE), states, 0.02)
+    assert cut.driven > 1 and cut.coverage == pytest.approx(0.85, abs=0.02)
+    assert not cut.is_whole
 
 
 def test_the_log_of_a_drive(tmp_path):
@@ -184,8 +184,8 @@ def run(tmp_path_factory):
     drives = [made(LINE, "own", 0.05, k) for k in range(2)]
     drives += [made(LINE, "attack", most, k) for k, most in enumerate((1.4, 1.6))]
     for drive in drives:
-        about = drive.environment, drive.route, drive.case, drive.run, drive.seed
-        spec = DriveSpec(*about, STEPS, {"format": FORMAT, "case": drive.case})
+        labels = drive.environment, drive.route, drive.case, drive.run, drive.seed
+        spec = DriveSpec(*labels, STEPS, {"format": FORMAT, "case": drive.case})
         store.add(spec, drive, 1.0)
     document = metrics_document({}, 1, drives, {"line": Lane(0.85, 1.75)}, COST)
     files.write_json(folder / "metrics.json", document)
@@ -215,16 +215,16 @@ def test_real_drives_are_an_environment_of_the_run(run, tmp_path, capsys):
     ]
     out = tmp_path / "compared"
     arguments = (run, "-o", out, "--criteria", tmp_path / "criteria.toml")
-    code, told, _ = call(capsys, *arguments)
-    assert code == 0 and "3.2 at 0.75, 3.2 at 0.25" in told  # drives that it will take
+    code, text, _ = call(capsys, *arguments)
+    assert code == 0 and "3.2 at 0.75, 3.2 at 0.25" in text  # drives that it will take
     assert not (out / "overhead.png").exists()
     arguments = (*arguments, "--own", plain, "--attack")
 
     def judged(count: int):
-        code, told, err = call(capsys, *arguments, *attacked[:count], "--json")
+        code, text, err = call(capsys, *arguments, *attacked[:count], "--json")
         assert code == 0, err
-        assert json.loads(told) == json.loads((out / "metrics.json").read_text())
-        return json.loads(told)
+        assert json.loads(text) == json.loads((out / "metrics.json").read_text())
+        return json.loads(text)
 
     assert judged(1)["test"]["decision"] == "go on"
     document = judged(4)
@@ -234,9 +234,9 @@ def test_real_drives_are_an_environment_of_the_run(run, tmp_path, capsys):
     assert rows[3]["coverage"] == pytest.approx(0.5, abs=0.05)
     environments = document["routes"]["line"]
     assert list(environments) == ["surrogate", "real"]
-    found = environments["real"]["attack"]
-    assert found["n"] == 4 and environments["surrogate"]["attack"]["n"] == 2
-    largest = [each["cross_track_max_m"] for each in found["per_run"]]
+    figures = environments["real"]["attack"]
+    assert figures["n"] == 4 and environments["surrogate"]["attack"]["n"] == 2
+    largest = [each["cross_track_max_m"] for each in figures["per_run"]]
     np.testing.assert_allclose(largest, [1.5, 0.2, 0.2 * np.exp(-1), 1.7], atol=0.02)
     test = document["test"]
     assert (test["drives"], test["successes"], test["decision"]) == (3, 2, "go on")

@@ -39,8 +39,8 @@ FIFTY = (  # without converging before
 
 
 def test_interrupted_deterministic_run_ends_bit_for_bit_as_the_whole(folder, tmp_path):
-    whole, output = tmp_path / "whole", tmp_path / "run"
-    expected = job(folder, whole, FIFTY).run()
+    uninterrupted, output = tmp_path / "whole", tmp_path / "run"
+    expected = job(folder, uninterrupted, FIFTY).run()
     # 4 steps an iteration: in the drive, and in the derivative
     for step in (4 * 17 + 1, 4 * 32 + 3):
         interrupt(folder, output, "surrogate: optimisation", step, change=FIFTY)
@@ -48,7 +48,7 @@ def test_interrupted_deterministic_run_ends_bit_for_bit_as_the_whole(folder, tmp
         assert iteration == step // 4
     result = job(folder, output, FIFTY).run()
     assert len(checkpoint_of(output)["history"]) == 50
-    assert_same_state(output, whole)
+    assert_same_state(output, uninterrupted)
     assert_same_drives(result["drives"], expected["drives"])
     assert result["curve"] == expected["curve"]
     assert len(result["curve"]["frames"]) == 51  # what the last update gave, too
@@ -56,8 +56,8 @@ def test_interrupted_deterministic_run_ends_bit_for_bit_as_the_whole(folder, tmp
     assert 0 < result["cost"]["checkpoint_s"] < result["cost"]["wall_s"]
 
 
-def test_what_is_finished_is_not_repeated(folder, whole, tmp_path):
-    output, seen = tmp_path / "run", []
+def test_what_is_finished_is_not_repeated(folder, uninterrupted, tmp_path):
+    output, reports = tmp_path / "run", []
     interrupt(folder, output, "surrogate: random textures", 3)  # in the second of 2
     assert len(list(output.glob("looks/*"))) == 1
     # 2 of each of 5 cases twice, of 2 steps each; in the last
@@ -65,25 +65,25 @@ def test_what_is_finished_is_not_repeated(folder, whole, tmp_path):
     before = checkpoint_of(output)
 
     def watch(*state):
-        seen.append(state[:3])
+        reports.append(state[:3])
 
     document = job(folder, output, on_progress=watch).run()
     job(folder, output, on_progress=watch).run()  # of which nothing is left
-    assert seen == [("drives", 39, 40), ("drives", 40, 40)]
+    assert reports == [("drives", 39, 40), ("drives", 40, 40)]
     for name, value in checkpoint_of(output).items():
         assert np.array_equal(value, before[name], equal_nan=True), name
     # 2 of each case, twice, 2 judged, the attack; drives that were cut short too
     assert document["cost"]["renders"] >= 2 * (10 + 10 + 2) + 6 * 2 * 2
-    assert_same_drives(document["drives"], whole[1]["drives"])
+    assert_same_drives(document["drives"], uninterrupted[1]["drives"])
 
 
 def test_error_within_an_update_keeps_the_checkpoint_before(
-    folder, whole, tmp_path, monkeypatch
+    folder, uninterrupted, tmp_path, monkeypatch
 ):
     original, calls = Adam.step, []
 
-    def fail_after(self, *arguments, **more):
-        original(self, *arguments, **more)
+    def fail_after(self, *arguments, **options):
+        original(self, *arguments, **options)
         calls.append(1)
         if len(calls) == 5:
             raise MemoryError
@@ -94,18 +94,18 @@ def test_error_within_an_update_keeps_the_checkpoint_before(
             job(folder, tmp_path).run()
     assert len(checkpoint_of(tmp_path)["history"]) == 3
     job(folder, tmp_path).run()
-    assert_same_state(tmp_path, whole[0])
+    assert_same_state(tmp_path, uninterrupted[0])
 
 
 def test_gradient_that_is_not_finite_costs_no_iteration(folder, tmp_path, monkeypatch):
     original, calls = Rollout.gradient, []
 
-    def spoil(self, *arguments, **more):
-        found = original(self, *arguments, **more)
+    def spoil(self, *arguments, **options):
+        gradient = original(self, *arguments, **options)
         calls.append(1)
         if len(calls) == 6:
-            found.textures[0][:] = float("nan")
-        return found
+            gradient.textures[0][:] = float("nan")
+        return gradient
 
     monkeypatch.setattr(Rollout, "gradient", spoil)
     with pytest.raises(InputError, match=r"iteration 5: .* object 0"):
@@ -141,7 +141,7 @@ def test_handlers_of_others_are_not_held():
 def test_random_generators_go_on_where_they_were():
     random.gauss(0, 1)
     np.random.normal()
-    kept = determinism.random_states()
+    states = determinism.random_states()
 
     def draw():
         numpy = np.random.normal(size=3).tolist()
@@ -149,7 +149,7 @@ def test_random_generators_go_on_where_they_were():
 
     expected = draw()
     assert draw() != expected
-    determinism.restore_random_states(kept)
+    determinism.restore_random_states(states)
     assert draw() == expected
 
 
@@ -212,9 +212,9 @@ def test_changed_file_and_version_are_named(folder, tmp_path, monkeypatch):
     files.write_safetensors(mine / "copy.safetensors", tensors, metadata)
     with pytest.raises(InputError, match=r"objects\[0\]\.field: .*copy\.safetensors"):
         job(mine, output, same).run()
-    found = module.versions()
-    monkeypatch.setattr(module, "versions", lambda: {**found, "drjit": "0.1"})
-    with pytest.raises(InputError, match=f"drjit: {found['drjit']} -> 0.1"):
+    versions = module.versions()
+    monkeypatch.setattr(module, "versions", lambda: {**versions, "drjit": "0.1"})
+    with pytest.raises(InputError, match=f"drjit: {versions['drjit']} -> 0.1"):
         job(folder, output).run()
 
 
@@ -257,13 +257,13 @@ def test_best_of_another_objective_is_measured_anew(folder, tmp_path):
     assert document["ignored_changes"]
 
 
-def test_version_alone_keeps_the_best(folder, whole, tmp_path, monkeypatch):
+def test_version_alone_keeps_the_best(folder, uninterrupted, tmp_path, monkeypatch):
     """The same objective gives the best parameters the value that they had."""
-    output, found, stages = tmp_path / "run", module.versions(), set()
-    shutil.copytree(whole[0], output)
+    output, versions, stages = tmp_path / "run", module.versions(), set()
+    shutil.copytree(uninterrupted[0], output)
     before = checkpoint_of(output)
-    monkeypatch.setattr(module, "versions", lambda: {**found, "drjit": "0.1"})
-    job(folder, output, on_progress=lambda *told: stages.add(told[0])).run(force=True)
+    monkeypatch.setattr(module, "versions", lambda: {**versions, "drjit": "0.1"})
+    job(folder, output, on_progress=lambda *state: stages.add(state[0])).run(force=True)
     assert "surrogate: best so far" in stages
     document = job(folder, output).run()  # not measured a second time
     assert document["cost"]["processes"] == 3
@@ -278,12 +278,12 @@ def test_version_alone_keeps_the_best(folder, whole, tmp_path, monkeypatch):
 def test_what_may_change_is_changed_by_force(
     folder, tmp_path, monkeypatch, first, then
 ):
-    seen, work = [], module.Job._attack
+    observations, work = [], module.Job._attack
 
     def watch(self, world, *arguments):
         before = world.appearance()
         attack = work(self, world, *arguments)
-        seen.append((before, world.appearance(), attack))
+        observations.append((before, world.appearance(), attack))
         return attack
 
     line, output = "deterministic = true", tmp_path / "run"
@@ -291,7 +291,7 @@ def test_what_may_change_is_changed_by_force(
     interrupt(folder, output, OPTIMISATION, 4 * 3 + 1, change=(line, old))
     monkeypatch.setattr(module.Job, "_attack", watch)
     job(folder, output, (line, new)).run(force=True)
-    before, after, attack = seen[0]
+    before, after, attack = observations[0]
     assert attack.iteration == 6
     assert np.array_equal(after.textures[0], attack.best[0])
     assert np.array_equal(after.offsets, attack.best_offsets)

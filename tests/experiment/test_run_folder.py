@@ -59,10 +59,10 @@ def test_a_scenario_of_which_nothing_was_done_is_replaced_by_force(folder, tmp_p
 
 def test_failed_checkpoint_leaves_the_one_before(folder, tmp_path, monkeypatch):
     """The disk fills up after the first checkpoint, of iteration 3."""
-    kept = {}
+    before = {}
 
     def fill():
-        kept.update(contents(tmp_path))
+        before.update(contents(tmp_path))
         monkeypatch.setattr(os, "write", lambda *_: have_no_space())
 
     progress = stop_at(OPTIMISATION, 4 * 4, fill)
@@ -71,7 +71,7 @@ def test_failed_checkpoint_leaves_the_one_before(folder, tmp_path, monkeypatch):
     assert failed.value.where == str(tmp_path / "checkpoint.safetensors")
     for iteration in ("iteration 6", "iteration 3"):  # what is lost, and what is not
         assert iteration in str(failed.value)
-    assert contents(tmp_path) == kept
+    assert contents(tmp_path) == before
 
 
 @pytest.mark.parametrize("stage", ["surrogate: own", OPTIMISATION])
@@ -96,8 +96,8 @@ def test_what_no_other_scenario_mends_is_kept(folder, tmp_path, step, cause):
     with pytest.raises(InputError, match="disk or gradient"):
         stop = stop_at(OPTIMISATION, step, refuse)
         job(folder, tmp_path, on_progress=stop).run()
-    seen = {path.name for path in tmp_path.iterdir()}
-    assert seen >= {"scenario.toml", "drives"}
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names >= {"scenario.toml", "drives"}
 
 
 def test_partial_files_of_writers_are_removed_and_no_others(tmp_path):
@@ -119,26 +119,28 @@ freedom.pose_limit_m = 0.5
 freedom.pose_learning_rate = 0.1"""
 
 
-def test_all_cases_drive_from_the_same_starts(whole):
-    drives = whole[1]["drives"]
+def test_all_cases_drive_from_the_same_starts(uninterrupted):
+    drives = uninterrupted[1]["drives"]
     starts = {}
     for drive in drives:
         starts.setdefault(drive.run, []).append(drive.states[0])
     assert {drive.case for drive in drives} == set(CASES)
-    for found in starts.values():
-        assert len(found) == 10  # five cases in two environments
-        assert np.ptp(found, axis=0).max() == 0
+    for poses in starts.values():
+        assert len(poses) == 10  # five cases in two environments
+        assert np.ptp(poses, axis=0).max() == 0
     assert not np.array_equal(starts[0][0], starts[1][0])
 
 
-def test_best_random_is_the_look_of_least_objective(whole):
-    folder, document = whole
+def test_best_random_is_the_look_of_least_objective(uninterrupted):
+    folder, document = uninterrupted
     drives = {(d.environment, d.case, d.run): d for d in document["drives"]}
-    kept = [files.read_safetensors(p) for p in sorted((folder / "looks").iterdir())]
+    looks = [files.read_safetensors(p) for p in sorted((folder / "looks").iterdir())]
     pattern = r'"objective":\s*(-?[\d.e+-]+)'
-    found = [float(re.search(pattern, meta["kept.record"])[1]) for _, meta in kept]
-    assert len(found) == 2 and found[0] != found[1]
-    best = int(np.argmin(found))
+    objectives = [
+        float(re.search(pattern, meta["kept.record"])[1]) for _, meta in looks
+    ]
+    assert len(objectives) == 2 and objectives[0] != objectives[1]
+    best = int(np.argmin(objectives))
     # of two looks and two starts: look k drives from start k
     for label in ("surrogate", "mitsuba"):
         one, other = (drives[label, case, best] for case in ("random", "best_random"))
@@ -147,19 +149,19 @@ def test_best_random_is_the_look_of_least_objective(whole):
 
 @pytest.mark.usefixtures("no_results")
 def test_random_poses_are_compared_with_attacks_on_poses(folder, tmp_path, monkeypatch):
-    seen = {}
+    looks = {}
 
-    def only_looks(output, done, *more):
-        seen.update(done.looks)
+    def only_looks(output, done, *arguments):
+        looks.update(done.looks)
         return {}
 
     monkeypatch.setattr(results, "write_results", only_looks)
     job(folder, tmp_path / "run", ("iterations = 6", f"iterations = 1\n{POSES}")).run()
-    assert list(seen) == ["no_object", "own", "attack", "random", "best_random"]
-    assert seen["no_object"] is None
+    assert list(looks) == ["no_object", "own", "attack", "random", "best_random"]
+    assert looks["no_object"] is None
     for case in ("random", "best_random", "attack"):
-        look = seen[case]
-        assert np.array_equal(look.textures[0], seen["own"].textures[0])
+        look = looks[case]
+        assert np.array_equal(look.textures[0], looks["own"].textures[0])
         shift = np.abs(look.offsets[0])
         assert shift[:2].max() <= 0.5 and not shift[2:5].any()
         assert case == "attack" or shift[:2].min() > 0
@@ -167,12 +169,12 @@ def test_random_poses_are_compared_with_attacks_on_poses(folder, tmp_path, monke
 
 @pytest.mark.usefixtures("no_results")
 def test_drives_past_a_lost_attack_count_where_it_finds_the_same(
-    folder, whole, tmp_path
+    folder, uninterrupted, tmp_path
 ):
     output, stages = tmp_path / "run", set()
-    shutil.copytree(whole[0], output)
+    shutil.copytree(uninterrupted[0], output)
     (output / "checkpoint.safetensors").unlink()
-    job(folder, output, on_progress=lambda *told: stages.add(told[0])).run()
+    job(folder, output, on_progress=lambda *state: stages.add(state[0])).run()
     assert stages == {"surrogate: optimisation"}
 
 

@@ -83,7 +83,7 @@ def main(scenario_file: Path, output: Path) -> None:
         world = build_world(scenario, scenario.build_policy())
         attack, count = build_attack(world), section.method.iterations(world.horizon)
         samples = {name: np.zeros(count, np.int64) for name in _held(0)}
-        if checkpoint.found:
+        if checkpoint.is_loaded:
             checkpoint.restore(attack)
         while attack.iteration < count:
             attack.step()
@@ -109,20 +109,23 @@ def test_two_thousand_iterations_neither_grow_nor_drift(tmp_path):
     assert ITERATIONS % (2 * EVERY) == 0 and ITERATIONS >= 4 * SETTLED
     count = {"max_iterations = 30": f"max_iterations = {ITERATIONS}"}
     scenario = write_scenario(tmp_path, CHANGES | count) / "scenario.toml"
-    whole, resumed = (files.make_folder(tmp_path / n) for n in ("whole", "resumed"))
+    uninterrupted, resumed = (
+        files.make_folder(tmp_path / n) for n in ("whole", "resumed")
+    )
     command = [*module_command("experiment.test_soak"), str(scenario)]
-    subprocess.run([*command, str(whole)], check=True)
-    shutil.move(whole / HALF, resumed / CHECKPOINT)
+    subprocess.run([*command, str(uninterrupted)], check=True)
+    shutil.move(uninterrupted / HALF, resumed / CHECKPOINT)
     subprocess.run([*command, str(resumed)], check=True)
 
-    found = figures(files.read_safetensors(whole / SAMPLES)[0])
-    print(json.dumps(found))
-    assert found["growth_b"] < MOST_GROWTH and found["compiled"] == 0
-    assert found["descriptors"] == found["threads"] == 0
-    objective = files.read_json(whole / JUDGED)
+    measured = figures(files.read_safetensors(uninterrupted / SAMPLES)[0])
+    print(json.dumps(measured))
+    assert measured["growth_b"] < MOST_GROWTH and measured["compiled"] == 0
+    assert measured["descriptors"] == measured["threads"] == 0
+    objective = files.read_json(uninterrupted / JUDGED)
     assert objective["tracked"] == objective["judged"] < 0
     one, other = (
-        files.read_safetensors(path / CHECKPOINT)[0] for path in (whole, resumed)
+        files.read_safetensors(path / CHECKPOINT)[0]
+        for path in (uninterrupted, resumed)
     )
     assert one.keys() == other.keys()
     for name, tensor in one.items():

@@ -61,9 +61,9 @@ def test_speeds_of_vehicle_and_route(scenario_folder, vehicle, drive, numbers):
         text = text.replace("[policy]", "[policy]\noutput = [0, 1]")
     path.write_text(text.replace("horizon = 4", drive) + vehicle)
     scenario, _ = load_scenario(path)
-    found = " ".join(speed_findings(build_world(scenario, scenario.build_policy())))
-    found = found.replace("routes.json", "").replace("'line'", "")
-    assert re.findall(r"\d+(?:\.\d+)?", found) == numbers
+    message = " ".join(speed_findings(build_world(scenario, scenario.build_policy())))
+    message = message.replace("routes.json", "").replace("'line'", "")
+    assert re.findall(r"\d+(?:\.\d+)?", message) == numbers
 
 
 @pytest.mark.parametrize(
@@ -83,9 +83,9 @@ def test_units_that_nothing_says(scenario_folder, keys, vehicle, named):
     path = scenario_folder / "units.toml"
     path.write_text(text.replace("[policy]", f"[policy]\n{keys}") + vehicle)
     scenario, _ = load_scenario(path)
-    found = list(unit_findings(build_world(scenario, scenario.build_policy())))
+    findings = list(unit_findings(build_world(scenario, scenario.build_policy())))
     keys = " and ".join(f"{name}.control_unit" for name in named)
-    assert [line.partition(":")[0] for line in found] == [keys] * bool(named)
+    assert [line.partition(":")[0] for line in findings] == [keys] * bool(named)
 
 
 @pytest.mark.parametrize(
@@ -99,5 +99,5 @@ def test_a_field_that_was_fitted_too_little_is_doubted(
     save_field(tmp_path / "fitted.safetensors", scene)
     change = [f"scene.field={tmp_path / 'fitted.safetensors'}"]
     scenario, _ = load_scenario(scenario_folder / "scenario.toml", settings=change)
-    found = list(fit_findings(build_world(scenario, scenario.build_policy())))
-    assert [f"{psnr} dB on average" in line for line in found] == [True] * doubted
+    findings = list(fit_findings(build_world(scenario, scenario.build_policy())))
+    assert [f"{psnr} dB on average" in line for line in findings] == [True] * doubted

@@ -62,8 +62,8 @@ def scenario(tmp_path_factory):
 def test_check_finds_no_fault(scenario, capsys, tmp_path):
     arguments = ["check", str(scenario), "--json", "-o", str(tmp_path / "p.png")]
     cli.main(arguments)
-    found = json.loads(capsys.readouterr().out)
-    assert not [line for line in found["refused"] if "control" in line], found
+    document = json.loads(capsys.readouterr().out)
+    assert not [line for line in document["refused"] if "control" in line], document
 
 
 def test_an_attack_and_its_pictures(scenario, tmp_path):
@@ -79,8 +79,8 @@ def test_an_attack_and_its_pictures(scenario, tmp_path):
     assert drive.controls.shape == (3, 2) and drive.controls[:, 1].any()
     assert (np.diff(drive.states[:, 3]) != 0).any()
     picture = run / "frames" / "surrogate_own" / "0000.exr"
-    told = read_metadata(picture)
-    np.testing.assert_allclose(json.loads(told["control"]), drive.controls[0])
+    metadata = read_metadata(picture)
+    np.testing.assert_allclose(json.loads(metadata["control"]), drive.controls[0])
     viewed = read_viewed(run)
     assert describe(viewed, drive, 0).count("rad, ") == 1
     assert describe(viewed, drive, 0).endswith("m/s^2")

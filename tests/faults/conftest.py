@@ -34,14 +34,14 @@ def start(tmp_path_factory) -> Iterator[Callable[[str], Runner]]:
             if world in JOBS:
                 before = begin(world)
                 before.begin()  # what it leaves names its inputs by their paths
-                source = before.whole
+                source = before.undisturbed
             else:
                 source = files.make_folder(base / "source")
                 getattr(worlds, world)(source, patch)
             runner = runners[name] = Runner(name, source, base, patch)
             runner.begin()
             assert runner.run(runner.watch) == 0
-            shutil.copytree(runner.folder, runner.whole, symlinks=True)
+            shutil.copytree(runner.folder, runner.undisturbed, symlinks=True)
             return runner
 
         yield begin

@@ -38,7 +38,7 @@ class Runner:
 
     def __post_init__(self) -> None:
         self.job: Job = JOBS[self.name]
-        self.folder, self.whole = self.base / "here", self.base / "whole"
+        self.folder, self.undisturbed = self.base / "here", self.base / "whole"
         self.scratch = files.make_folder(self.base / "scratch")
 
     def begin(self) -> Path:
@@ -65,7 +65,9 @@ class Runner:
     def finish(self, watch: Watch | None = None) -> None:
         """Run it to its end, which is that of the undisturbed job."""
         assert self.run(watch) == 0
-        ends = [contents(path, self.job.equal) for path in (self.folder, self.whole)]
+        ends = [
+            contents(path, self.job.equal) for path in (self.folder, self.undisturbed)
+        ]
         names = sorted({*ends[0], *ends[1]})
         other = [name for name in names if ends[0].get(name) != ends[1].get(name)]
         assert names and not other, other
@@ -78,8 +80,8 @@ def partial_files(folder: Path) -> list[Path]:
 
 def times(folder: Path, pattern: str) -> dict[Path, int]:
     """Return when each file was written."""
-    found = folder.glob(pattern) if pattern else ()
-    return {path: path.stat().st_mtime_ns for path in found if path.is_file()}
+    paths = folder.glob(pattern) if pattern else ()
+    return {path: path.stat().st_mtime_ns for path in paths if path.is_file()}
 
 
 def contents(folder: Path, patterns: tuple[str, ...]) -> dict[str, object]:
@@ -92,6 +94,8 @@ def _content(path: Path) -> object:
     raw = path.read_bytes()
     if path.suffix != ".safetensors" or b"kept.record" not in raw:
         return raw
-    tensors, about = files.read_safetensors(path)
-    about.pop("kept.record")
-    return {name: (v.dtype, v.shape, v.tobytes()) for name, v in tensors.items()}, about
+    tensors, metadata = files.read_safetensors(path)
+    metadata.pop("kept.record")
+    return {
+        name: (v.dtype, v.shape, v.tobytes()) for name, v in tensors.items()
+    }, metadata

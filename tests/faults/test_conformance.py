@@ -71,7 +71,7 @@ def faults(runner: Runner, event: str) -> list[Watch]:
 
 @pytest.mark.parametrize("event", EVENTS)
 def test_a_disturbed_job_goes_on_to_the_same_bits(runner, event, capsys):
-    job, kept = runner.job, {}
+    job, times_ns = runner.job, {}
     folder = runner.begin()
     for watch in faults(runner, event):
         capsys.readouterr()
@@ -85,11 +85,11 @@ def test_a_disturbed_job_goes_on_to_the_same_bits(runner, event, capsys):
             code = runner.run(watch)
             check_end(runner, event, code, capsys.readouterr().err)
         assert watch.met, watch
-        assert times(folder, job.keeps).items() >= kept.items(), watch
-        kept = times(folder, job.keeps)
+        assert times(folder, job.keeps).items() >= times_ns.items(), watch
+        times_ns = times(folder, job.keeps)
     again = Watch()
     runner.finish(again)
-    for kind, count in Counter(kind_of(path.name) for path in kept).items():
+    for kind, count in Counter(kind_of(path.name) for path in times_ns).items():
         assert again.files.get(kind, 0) + count == runner.watch.files[kind]
     left = set(partial_files(folder))
     assert left.issubset(folder.glob(job.leaves) if job.leaves else ())
@@ -158,17 +158,17 @@ def test_a_command_that_writes_at_its_end_checks_first(
 ):
     """Before it reads anything that takes long; most inputs are missing."""
     monkeypatch.chdir(tmp_path)
-    given, claimed = words.format(scenes=SCENES).split(), WRITERS[words]
+    arguments, claimed = words.format(scenes=SCENES).split(), WRITERS[words]
     if claimed:
         Path(claimed).mkdir()
         with locks.exclusive(claimed):
-            assert cli.main(given) == 2
+            assert cli.main(arguments) == 2
         assert f"{claimed}: {LOCKED}" in capsys.readouterr().err
         Path(claimed).rmdir()
     tmp_path.chmod(0o555)
     try:
         with obeyed_modes():
-            assert cli.main(given) == 2
+            assert cli.main(arguments) == 2
     finally:
         tmp_path.chmod(0o755)
     assert FORBIDDEN in capsys.readouterr().err

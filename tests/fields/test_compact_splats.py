@@ -16,21 +16,21 @@ from mi_nerfattack.fields.compact_splats import load_splats
 from mi_nerfattack.fields.splats import Splats, read_splats
 
 
-def agree(found: Splats, item: Splats, turns: float, colours: float) -> None:
-    np.testing.assert_allclose(found.centers, item.centers, atol=2e-4)
-    np.testing.assert_allclose(found.scales, item.scales, rtol=0.04)
-    np.testing.assert_allclose(found.opacities, item.opacities, atol=0.003)
-    cosine = np.abs((found.quaternions * item.quaternions).sum(1))
+def agree(loaded: Splats, item: Splats, turns: float, colours: float) -> None:
+    np.testing.assert_allclose(loaded.centers, item.centers, atol=2e-4)
+    np.testing.assert_allclose(loaded.scales, item.scales, rtol=0.04)
+    np.testing.assert_allclose(loaded.opacities, item.opacities, atol=0.003)
+    cosine = np.abs((loaded.quaternions * item.quaternions).sum(1))
     assert cosine.min() > np.cos(turns)
-    np.testing.assert_allclose(found.harmonics, item.harmonics, atol=colours)
+    np.testing.assert_allclose(loaded.harmonics, item.harmonics, atol=colours)
 
 
 @pytest.fixture
 def item(rng, variant) -> Splats:
     """Forty splats of degree 3."""
     item = made.cloud(rng, 40)
-    rest = rng.uniform(-0.4, 0.4, (40, 15, 3)).astype(np.float32)
-    return replace(item, harmonics=np.concatenate([item.harmonics, rest], 1))
+    bands = rng.uniform(-0.4, 0.4, (40, 15, 3)).astype(np.float32)
+    return replace(item, harmonics=np.concatenate([item.harmonics, bands], 1))
 
 
 @pytest.mark.parametrize(("version", "turns"), [(2, 0.1), (3, 0.005)])
@@ -55,12 +55,12 @@ def test_ply_is_read_as_before(tmp_path: Path, item) -> None:
 
 
 def test_what_is_no_splats_is_refused(tmp_path: Path, item) -> None:
-    whole, web = gzip.compress(spz(item)), splat(item)
+    compressed, web = gzip.compress(spz(item)), splat(item)
     nan = np.full(3, np.nan, np.float32).tobytes()
     cases = {
         "a.spz": (
-            (whole[:-20], "ends early"),
-            (b"PK" + whole, "incorrect header check; damaged"),
+            (compressed[:-20], "ends early"),
+            (b"PK" + compressed, "incorrect header check; damaged"),
             (gzip.compress(b"ply\n" + bytes(20)), "does not begin as an .spz"),
             (gzip.compress(spz(item)[:-1]), "damaged; export"),
             (gzip.compress(spz(item, 4)), "version 4; versions 2 and 3"),

@@ -175,9 +175,9 @@ def test_occupancy_query_and_exit_against_brute_force(shape, share, seed) -> Non
     direction[0] = [0, 0, -2]
     place, heading = mi.Point3f(unit.T.copy()), mi.Vector3f(direction.T.copy())
     distance, cell = occupancy.query(place, mi.Bool(True))
-    found = np.minimum((unit * shape).astype(int), np.array(shape) - 1)
-    np.testing.assert_array_equal(cell.numpy().T, found)
-    expected = brute_distance(cells)[tuple(found.T)]
+    indices = np.minimum((unit * shape).astype(int), np.array(shape) - 1)
+    np.testing.assert_array_equal(cell.numpy().T, indices)
+    expected = brute_distance(cells)[tuple(indices.T)]
     np.testing.assert_array_equal(distance.numpy(), expected)
 
     reach = occupancy.exit(place, heading, cell, distance).numpy()
@@ -186,12 +186,12 @@ def test_occupancy_query_and_exit_against_brute_force(shape, share, seed) -> Non
         # Every place before the exit lies in an empty cell or outside of the grid.
         t = np.linspace(0, min(reach[k], 1e3), 64)[:-1]
         walk = (unit[k] + t[:, None] * direction[k]) * shape
-        walked = np.floor(walk + 1e-4 * np.sign(found[k] + 0.5 - walk)).astype(int)
+        walked = np.floor(walk + 1e-4 * np.sign(indices[k] + 0.5 - walk)).astype(int)
         inside = ((walked >= 0) & (walked < shape)).all(1)
         assert not cells[tuple(walked[inside].T)].any()
         # The exit lies on the surface of the block of 2 n - 1 cells.
         end = (unit[k] + reach[k] * direction[k].astype(float)) * shape
-        gap = np.abs(end - (found[k] + 0.5)).max()
+        gap = np.abs(end - (indices[k] + 0.5)).max()
         assert gap == pytest.approx(expected[k] - 0.5, rel=1e-3, abs=1e-3)
 
 
@@ -206,16 +206,18 @@ def test_empty_octants_of_occupied_cells(rng) -> None:
     direction = rng.normal(size=(500, 3)).astype(np.float32)
     place, heading = mi.Point3f(unit.T.copy()), mi.Vector3f(direction.T.copy())
     distance, cell = occupancy.query(place, mi.Bool(True))
-    found = distance.numpy()
+    distances = distance.numpy()
     half = tuple((unit * fine.shape).astype(int).T)
-    np.testing.assert_array_equal(found == 0, fine[half] > 0)
-    whole = brute_distance(fine.reshape(3, 2, 4, 2, 5, 2).any((1, 3, 5)))
+    np.testing.assert_array_equal(distances == 0, fine[half] > 0)
+    cell_distances = brute_distance(fine.reshape(3, 2, 4, 2, 5, 2).any((1, 3, 5)))
     cell = tuple(cell.numpy().astype(int))
-    np.testing.assert_array_equal(found[found >= 1], whole[cell][found >= 1])
-    assert set(found[whole[cell] == 0]) == {0, 0.5}
+    np.testing.assert_array_equal(
+        distances[distances >= 1], cell_distances[cell][distances >= 1]
+    )
+    assert set(distances[cell_distances[cell] == 0]) == {0, 0.5}
     # no way out of an octant leads past its faces
     reach = occupancy.exit(place, heading, mi.Point3f(*cell), distance).numpy()
-    for k in np.flatnonzero(found == 0.5):
+    for k in np.flatnonzero(distances == 0.5):
         end = (unit[k] + reach[k] * direction[k].astype(float)) * fine.shape
         assert np.abs(end - np.array(half)[:, k] - 0.5).max() <= 0.501
 
@@ -279,15 +281,15 @@ def test_read_vertices_are_the_corners_of_cells_with_points(shape, rng) -> None:
 def crossings(field: GridField) -> np.ndarray:
     """Return where planes of vertices meet in occupied cells, (n, 3) of the box."""
     planes = [np.arange(x.resolution) / x.scale for x in field.levels()]
-    found = []
+    points = []
     for cell in np.argwhere(field.window.cells):
         edges = np.array([cell, cell + 1]) / field.window.cells.shape
         places = [
             [x for x in np.unique(np.concatenate([*planes, edge])) if a <= x <= b]
             for edge, a, b in zip(edges.T, *edges, strict=True)
         ]
-        found.append(np.stack(np.meshgrid(*places), -1).reshape(-1, 3))
-    return np.concatenate(found)
+        points.append(np.stack(np.meshgrid(*places), -1).reshape(-1, 3))
+    return np.concatenate(points)
 
 
 @pytest.mark.parametrize("layout", [GridLayout(4, 3, 9), GridLayout(1, 6, 6)])

@@ -33,11 +33,11 @@ def check_rewritten(folder: Path, field: AnyField) -> AnyField:
     """Check that a field from a file is written to the same bytes, and return it."""
     first, second = folder / "a.safetensors", folder / "b.safetensors"
     save_field(first, field)
-    found = load_field(first)
-    assert type(found) is type(field) and found.metadata() == field.metadata()
-    save_field(second, found)
+    loaded = load_field(first)
+    assert type(loaded) is type(field) and loaded.metadata() == field.metadata()
+    save_field(second, loaded)
     assert first.read_bytes() == second.read_bytes()
-    return found
+    return loaded
 
 
 def appearance(field: AnyField, points: np.ndarray) -> list[np.ndarray]:
@@ -61,15 +61,15 @@ def test_grid_file_keeps_all_within_half_precision(tmp_path, rng) -> None:
         step_m=0.0123,
         info={"provenance": "test", "fit.psnr": "30.1"},
     )
-    found = check_rewritten(tmp_path, field)
+    loaded = check_rewritten(tmp_path, field)
     held = field.held_vertices()
     half = np.where(held[:, None], texture, 0).astype(np.float16)
-    np.testing.assert_array_equal(found.texture, half)
+    np.testing.assert_array_equal(loaded.texture, half)
     raw = np.where(held, density, 0).astype(np.float16)
-    np.testing.assert_array_equal(found.parameters()["density"].numpy(), raw)
-    np.testing.assert_array_equal(found.occupancy.cells, cells)
-    assert (found.step_m, found.density_scale) == (0.0123, 3.25)
-    np.testing.assert_array_equal(found.upper, field.upper)
+    np.testing.assert_array_equal(loaded.parameters()["density"].numpy(), raw)
+    np.testing.assert_array_equal(loaded.occupancy.cells, cells)
+    assert (loaded.step_m, loaded.density_scale) == (0.0123, 3.25)
+    np.testing.assert_array_equal(loaded.upper, field.upper)
 
 
 def write_all_vertices(path: Path, field: GridField) -> None:
@@ -90,15 +90,15 @@ def test_a_file_shows_what_one_of_all_vertices_does(tmp_path, rng) -> None:
     half = field.texture.numpy().astype(np.float16)
     np.testing.assert_array_equal(old.texture, half)
     save_field(path, old)
-    found = load_grid(path)
-    assert (np.array(found.texture) != half).any()
+    rewritten = load_grid(path)
+    assert (np.array(rewritten.texture) != half).any()
     at, faces = rng.uniform(0, 1, (2000, 3)), rng.choice([1e-7, 1 - 1e-7], (2000, 3))
     at = np.where(rng.random((2000, 3)) < 0.3, faces, at)
     points = np.argwhere(cells)[rng.integers(cells.sum(), size=2000)] + at
     points = 2 * points / cells.shape - 1
     expected = small.evaluate(old, points)
     assert expected[0].max() > 0.01
-    for value, other in zip(small.evaluate(found, points), expected, strict=True):
+    for value, other in zip(small.evaluate(rewritten, points), expected, strict=True):
         np.testing.assert_array_equal(value, other)
 
 
@@ -109,12 +109,12 @@ def test_a_file_evaluates_the_same(tmp_path: Path, rng, kind: str) -> None:
         field = small.small_ngp(cone=1 / 64)
         half = field.parameters()["table"].numpy().astype(np.float16)
         field.set_parameter("table", mi.Float(half.astype(np.float32)))
-    found = check_rewritten(tmp_path, field)
-    assert found.cone == 1 / 64
+    loaded = check_rewritten(tmp_path, field)
+    assert loaded.cone == 1 / 64
     points = rng.uniform(-1, 1, (50, 3))
     expected = appearance(field, points)
     assert (expected[0] > 0).any()
-    for value, other in zip(appearance(found, points), expected, strict=True):
+    for value, other in zip(appearance(loaded, points), expected, strict=True):
         np.testing.assert_array_equal(value, other)
 
 
@@ -299,8 +299,8 @@ def test_a_reader_written_from_the_page_sees_the_same_field(name, rng, tmp_path)
     near = points + rounding * np.vstack([np.eye(3), -np.eye(3)])[:, None]
     around = [np.where(there, reader.density(place), 0) for place in near]
     spread = np.abs(np.array(around) - expected).max(0)
-    seen = expected > 100 * limit
-    assert np.median(spread[seen] / expected[seen]) < 1e-3
+    dense = expected > 100 * limit
+    assert np.median(spread[dense] / expected[dense]) < 1e-3
     limit = limit + spread
     assert (np.abs(np.array(density) - expected) <= limit + 2e-3 * expected).all()
     expected = reader.radiance(points.astype(float), directions.astype(float))

@@ -67,18 +67,18 @@ def test_a_new_texture_counts_at_once(field, rng, stepped, changed):
             shape = texture[levels[level].vertices].shape
             texture[levels[level].vertices] += rng.normal(size=shape)
         field.set_parameter("texture", texture)
-        found = at(field, points)
+        actual = at(field, points)
     fresh = again(field)
     with fresh.one_level(levels[-1]):
-        np.testing.assert_allclose(found, at(fresh, points), atol=2e-5)
+        np.testing.assert_allclose(actual, at(fresh, points), atol=2e-5)
     np.testing.assert_array_equal(at(field, points), at(fresh, points))
 
 
 def again(field: GridField) -> GridField:
     """Make another field of the same numbers."""
     density = field.parameters()["density"]
-    rest = field.lower, field.upper, density, field.texture
-    return GridField(field.layout, *rest)
+    arrays = field.lower, field.upper, density, field.texture
+    return GridField(field.layout, *arrays)
 
 
 @pytest.mark.parametrize("changed", [[-1, -1], [-1, 0]])
@@ -101,13 +101,13 @@ def test_the_gradient_is_the_transpose(field, rng, stepped):
     with field.one_level(level):
         before = field.packed.numpy().astype(float)
         weights = rng.normal(size=before.size).astype(np.float32)
-        found = field.texture_gradient(mi.Float(weights)).numpy()
+        derivative = field.texture_gradient(mi.Float(weights)).numpy()
         field.set_parameter("texture", texture + change)
         moved = field.packed.numpy() - before
     inside = np.zeros(len(texture), bool)
     inside[level.vertices] = True
-    assert np.isnan(found[~inside]).all()
-    assert np.vdot(found[inside], change[inside]) == pytest.approx(
+    assert np.isnan(derivative[~inside]).all()
+    assert np.vdot(derivative[inside], change[inside]) == pytest.approx(
         moved @ weights, rel=1e-4
     )
 
@@ -118,8 +118,8 @@ def test_drives_differentiate_what_they_march():
     level, base = item.levels()[-1], toy.texture_of(item)
     (posed,) = loop.sensor.objects
     with item.one_level(level):
-        found = toy.gradient(rollout, more=loop.sensor.pose_keys)
-        by_texture = found.textures[0].numpy()[level.vertices].astype(float)
+        gradients = toy.gradient(rollout, extra_keys=loop.sensor.pose_keys)
+        by_texture = gradients.textures[0].numpy()[level.vertices].astype(float)
         direction = toy.unit(by_texture)
 
         def of_texture(s):
@@ -135,26 +135,26 @@ def test_drives_differentiate_what_they_march():
         expected = pytest.approx(np.linalg.norm(by_texture), rel=1e-3)
         assert central_difference(of_texture, 0.2) == expected
         loop.sensor.set_textures([mi.TensorXf(base)])
-        by_shift = offset_gradients(loop.sensor, found)[0, 0]
+        by_shift = offset_gradients(loop.sensor, gradients)[0, 0]
         # samples that cross the faces of cells cost accuracy, with all levels, too
         expected = pytest.approx(by_shift, rel=2e-2)
         assert central_difference(of_pose, 2e-3) == expected
 
 
 def test_an_attack_leaves_the_field_as_it_is_saved():
-    found = {}
+    objectives = {}
     for one_level in (False, True):
         loop, item = toy.make_loop()
         rollout, initial = toy.make_rollout(loop, 3), loop.initial(toy.INITIAL)
-        rest = rollout, toy.ROUTE, initial, Freedom(0.1)
-        attack = GradientAttack(*rest, one_level=one_level)
+        problem = rollout, toy.ROUTE, initial, Freedom(0.1)
+        attack = GradientAttack(*problem, one_level=one_level)
         values = [attack.step().objective for _ in range(3)]
         attack.finish()
         assert dr.width(item.packed) == 4 * item.n_vertices
         value = rollout.measure(initial).value
         assert attack.judged_objective == pytest.approx(value, rel=1e-6)
-        found[one_level] = values, value
-    (exact, judged), (near, near_judged) = found[False], found[True]
+        objectives[one_level] = values, value
+    (exact, judged), (near, near_judged) = objectives[False], objectives[True]
     assert near != exact
     np.testing.assert_allclose(near, exact, rtol=0.02)
     assert near[-1] < near[0] and near_judged == pytest.approx(judged, rel=0.02)
@@ -168,13 +168,13 @@ def small_attack() -> GradientAttack:
 
 def test_an_attack_goes_on_to_the_same_bits():
     with deterministic():
-        whole, first, second = small_attack(), small_attack(), small_attack()
-        for attack, steps in ((whole, 4), (first, 2), (second, 2)):
+        uninterrupted, first, second = small_attack(), small_attack(), small_attack()
+        for attack, steps in ((uninterrupted, 4), (first, 2), (second, 2)):
             if attack is second:
                 attack.load_tensors(first.tensors())
             for _ in range(steps):
                 attack.step()
-    expected = whole.tensors()
+    expected = uninterrupted.tensors()
     for key, value in second.tensors().items():
         np.testing.assert_array_equal(value, expected[key], key)
 
@@ -186,7 +186,11 @@ def test_what_it_has_no_derivative_by_is_refused(field):
         texture = gradient = lambda self, *values: None
 
     loop, _ = toy.make_loop()
-    rest = toy.ROUTE, loop.initial(toy.INITIAL), Freedom(0.1, colouring=lambda _: Own())
+    problem = (
+        toy.ROUTE,
+        loop.initial(toy.INITIAL),
+        Freedom(0.1, colouring=lambda _: Own()),
+    )
     with field.one_level(field.levels()[-1]):
         with pytest.raises(InputError, match="density: .*one level"):
             field.set_parameter("density", field.parameters()["density"])
@@ -204,7 +208,7 @@ def test_what_it_has_no_derivative_by_is_refused(field):
         ):
             pass
     with pytest.raises(InputError, match="one_level: Own may step in all levels"):
-        GradientAttack(toy.make_rollout(loop, 3), *rest, one_level=True)
+        GradientAttack(toy.make_rollout(loop, 3), *problem, one_level=True)
 
 
 @pytest.mark.parametrize(
@@ -219,10 +223,10 @@ def test_bundled_objects_look_alike(name, least):
     for turn in np.arange(6) * 60.0:
         posed = PosedField(field, Pose.upright((2.0 * size, 0, 0), np.radians(turn)))
         sensor, images = field_sensor([], [posed], camera, mount), []
-        for how in (nullcontext(), field.one_level(field.levels()[-1])):
-            with how:
-                seen = sensor.observe(to_state(np.zeros((1, 3))), 0)
-                images.append(seen.image.numpy()[0].copy())
+        for context in (nullcontext(), field.one_level(field.levels()[-1])):
+            with context:
+                observation = sensor.observe(to_state(np.zeros((1, 3))), 0)
+                images.append(observation.image.numpy()[0].copy())
         squares.append(np.square(images[1] - images[0]).mean(-1))
         shown.append(images[0].sum(-1) > 0.01)
     error, own = np.array(squares), np.array(shown)

@@ -44,22 +44,22 @@ def test_a_grid_does_not_share_the_memory_of_the_caller(grid, name, makes, rng) 
 def test_other_fields_do_not_share_the_memory_of_the_caller() -> None:
     direction, at = mi.Vector3f(0.6, 0, 0.8), mi.Point3f(0.1, 0.2, 0.3)
     made = small.small_ngp()
-    given = {name: value.copy() for name, value in made.tensors().items()}
-    ngp = NGPField(made.layout, made.lower, made.upper, given)
+    tensors = {name: value.copy() for name, value in made.tensors().items()}
+    ngp = NGPField(made.layout, made.lower, made.upper, tensors)
     octants, one = np.full((1, 1, 1), 255, np.uint8), np.ones(1, np.uint8)
     words, sky = np.full(8, 99, np.uint32), np.ones((2, 3, 3), np.float32)
-    parts = Occupancy(octants > 0, octants), one, words, Codes(-1.0, 1.0), sky
-    bricks = BrickField(-small.ONES, small.ONES, *parts, step_m=0.1, cone=0.0)
+    contents = Occupancy(octants > 0, octants), one, words, Codes(-1.0, 1.0), sky
+    bricks = BrickField(-small.ONES, small.ONES, *contents, step_m=0.1, cone=0.0)
 
     def values() -> list[np.ndarray]:
-        seen = [bricks.occupancy.query(at, mi.Bool(True))[0]]
+        outputs = [bricks.occupancy.query(at, mi.Bool(True))[0]]
         for field in (ngp, bricks):
-            seen += [*field.eval(at, direction, mi.Bool(True))]
-            seen.append(field.background(direction))
-        return [x.numpy() for x in seen]
+            outputs += [*field.eval(at, direction, mi.Bool(True))]
+            outputs.append(field.background(direction))
+        return [x.numpy() for x in outputs]
 
     before = values()
-    for array in (*given.values(), octants, words, sky, one):
+    for array in (*tensors.values(), octants, words, sky, one):
         array[...] = 3
     for old, new in zip(before, values(), strict=True):
         np.testing.assert_array_equal(old, new)
@@ -121,9 +121,9 @@ def test_a_direction_that_is_no_number_reads_inside_of_the_sky(towards, monkeypa
     direction = mi.Vector3f(*[mi.Float([v, 0.6]) for v in towards])
     indices, gather = [], dr.gather
 
-    def record(kind, source, index, *more):
+    def record(kind, source, index, *arguments):
         indices.append(index.numpy().copy())
-        return gather(kind, source, dr.minimum(index, 5), *more)
+        return gather(kind, source, dr.minimum(index, 5), *arguments)
 
     monkeypatch.setattr(dr, "gather", record)
     colour = sky_colour(dr.ones(mi.Float, 2 * 3 * 3), (2, 3), direction)
@@ -164,8 +164,8 @@ def test_masked_pairs_are_zero():
     for odd in (0.5, 0.1):
         words = pack_words(np.array([odd, 2, 3, 4], np.float32))
         pair = words.gather(mi.UInt32([0, 1]), mi.Bool([False, True]))
-        found = np.array(pair) * words.scale
-        np.testing.assert_array_equal(found, [[0, 3], [0, 4]])
+        values = np.array(pair) * words.scale
+        np.testing.assert_array_equal(values, [[0, 3], [0, 4]])
 
 
 def test_memory_that_drjit_knows_is_copied():
@@ -206,10 +206,10 @@ def test_blobs_are_smoother_than_noise(small_one):
         """Mean square change over 0.02 of the box, by the variance."""
         ratio = []
         for seed in range(10):
-            here, beside = (
+            unshifted, shifted = (
                 colours(small_one, kind, seed, shift) for shift in (0, 0.02)
             )
-            ratio.append(np.mean((beside - here) ** 2) / here.var(1).mean())
+            ratio.append(np.mean((shifted - unshifted) ** 2) / unshifted.var(1).mean())
         return float(np.mean(ratio))
 
     assert roughness("blobs") < 0.5 * roughness("noise")

@@ -26,17 +26,17 @@ def same(a: Splats, b: Splats) -> None:
 def values(rng) -> dict[str, np.ndarray]:
     """Columns of seven splats of degree 2."""
     item = made.cloud(rng, 7)
-    rest = rng.normal(0, 0.3, (7, 8, 3)).astype(np.float32)
+    bands = rng.normal(0, 0.3, (7, 8, 3)).astype(np.float32)
     return made.columns(
-        replace(item, harmonics=np.concatenate([item.harmonics, rest], 1))
+        replace(item, harmonics=np.concatenate([item.harmonics, bands], 1))
     )
 
 
 @pytest.mark.parametrize(("degree", "text"), [(0, True), (1, False), (3, False)])
 def test_files_come_back(tmp_path: Path, rng, text: bool, degree: int) -> None:
     item = made.cloud(rng, 20)
-    rest = rng.normal(0, 0.3, (20, (degree + 1) ** 2 - 1, 3)).astype(np.float32)
-    item = replace(item, harmonics=np.concatenate([item.harmonics, rest], 1))
+    bands = rng.normal(0, 0.3, (20, (degree + 1) ** 2 - 1, 3)).astype(np.float32)
+    item = replace(item, harmonics=np.concatenate([item.harmonics, bands], 1))
     path = made.write_ply(tmp_path / "s.ply", made.columns(item), text)
     loaded = read_splats(path)
     assert loaded.degree == degree and loaded.count == 20
@@ -50,14 +50,14 @@ def test_mitsuba_reads_the_same(tmp_path: Path, values) -> None:
     ours = read_splats(path)
     theirs = mi.traverse(mi.load_dict({"type": "ellipsoids", "filename": str(path)}))
     data = theirs["data"].numpy().reshape(7, 10)
-    for expected, found in [
+    for expected, actual in [
         (data[:, :3], ours.centers),
         (data[:, 3:6], ours.scales),
         (data[:, [9, 6, 7, 8]], ours.quaternions),  # theirs are x, y, z, w
         (theirs["opacities"].numpy(), ours.opacities),
         (theirs["sh_coeffs"].numpy().reshape(7, 9, 3), ours.harmonics),
     ]:
-        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(actual, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_other_orders_types_properties_and_lengths_are_read(tmp_path, values) -> None:

@@ -32,12 +32,12 @@ def points(rng: np.random.Generator, count: int = 20_000) -> np.ndarray:
 
 def test_the_factor_is_that_of_the_definition(rng) -> None:
     cells, unit = some_cells(rng), points(rng)
-    found = Window(cells)(mi.Point3f(unit.T), mi.Bool(True)).numpy()
+    factor = Window(cells)(mi.Point3f(unit.T), mi.Bool(True)).numpy()
     expected = window(cells, unit.astype(float))
-    np.testing.assert_allclose(found, expected, atol=1e-4)
-    assert (found[expected == 0] == 0).all()
-    assert 0.1 < (found == 1).mean() < 0.7
-    assert ((found > 0.01) & (found < 0.99)).sum() > 500
+    np.testing.assert_allclose(factor, expected, atol=1e-4)
+    assert (factor[expected == 0] == 0).all()
+    assert 0.1 < (factor == 1).mean() < 0.7
+    assert ((factor > 0.01) & (factor < 0.99)).sum() > 500
     everywhere = Window(np.ones(SHAPE, bool))(mi.Point3f(unit.T), mi.Bool(True))
     assert (everywhere.numpy() == 1).all()  # no empty cell: it ends at its box
 
@@ -47,12 +47,12 @@ def test_the_slope_is_that_of_the_factor(rng) -> None:
     place = mi.Point3f(unit.T)
     dr.enable_grad(place)
     dr.backward(Window(cells)(place, mi.Bool(True)))
-    found = dr.grad(place).numpy().T
+    slope = dr.grad(place).numpy().T
 
     along, h = rng.normal(size=unit.shape), 1e-6
     ends = [window(cells, unit.astype(float) + s * along) for s in (h, -h)]
     expected = (ends[0] - ends[1]) / (2 * h)
-    wrong = np.abs((found * along).sum(1) - expected) > 1e-2 * (1 + np.abs(expected))
+    wrong = np.abs((slope * along).sum(1) - expected) > 1e-2 * (1 + np.abs(expected))
     inside = ((unit > 0) & (unit < 1)).all(1)
     assert wrong[inside].mean() < 1e-3  # at kinks, and within 1e-6 of them
 
@@ -68,11 +68,11 @@ def test_whatever_evaluates_a_field_sees_the_same(make, rng) -> None:
     heading, active = mi.Vector3f(0, 0, 1), mi.Bool(True)
     expected = field.density_everywhere(place, active).numpy()
     expected *= window(cells, unit.astype(float))
-    found = [field.eval(place, heading, active)[0], field.density(place, active)]
+    densities = [field.eval(place, heading, active)[0], field.density(place, active)]
     if field.kind == "ngp_field":
         packed = PackedNGP(field)
-        found.append(packed.eval(place, packed.view(heading), active)[0])
-    for density in found:
+        densities.append(packed.eval(place, packed.view(heading), active)[0])
+    for density in densities:
         limit = 1e-4 * expected.max()
         np.testing.assert_allclose(density.numpy(), expected, atol=limit)
 

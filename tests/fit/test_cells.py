@@ -125,10 +125,10 @@ def test_dense_octants_against_their_densities_one_by_one(rng):
     blocks = density.reshape(4, 2, 3, 3, 2, 3, 2, 2, 3).max((2, 5, 8))
     bits = (blocks >= middle).transpose(0, 2, 4, 1, 3, 5).reshape(4, 3, 2, 8)
     expected = np.packbits(bits, axis=-1, bitorder="little")[..., 0]
-    found = dense_octants(field, 1 - np.exp(-middle * field.step_m))
-    differs = np.unpackbits(found ^ expected).sum()
+    octants = dense_octants(field, 1 - np.exp(-middle * field.step_m))
+    differs = np.unpackbits(octants ^ expected).sum()
     assert differs <= 1  # the median is one of the densities, but for rounding
-    assert 0 < np.unpackbits(found[cells]).mean() < 1 and not found[~cells].any()
+    assert 0 < np.unpackbits(octants[cells]).mean() < 1 and not octants[~cells].any()
 
 
 def test_no_cell_no_octant():
@@ -154,5 +154,5 @@ def test_cells_show_in_front_of_the_first_surface_alone():
     shown = seen_matter(field, images, [0], min_weight=0.05)
     assert not shown[~full].any() and shown[12, 6:14, 10:14].all()
     assert not shown[13:].any() and not shown[:11].any()
-    more = seen_matter(field, images, [0], min_weight=1e-3)
-    assert more[16, 6:14, 6:14].any() and not more[:10, 6:14, 11:14].any()
+    with_haze = seen_matter(field, images, [0], min_weight=1e-3)
+    assert with_haze[16, 6:14, 6:14].any() and not with_haze[:10, 6:14, 11:14].any()

@@ -28,7 +28,7 @@ from mi_nerfattack.capture.mesh.cube_faces import render_faces
 from mi_nerfattack.capture.mesh.mesh import CUBE_FACES
 from mi_nerfattack.capture.posed_images import held_out
 from mi_nerfattack.commands.asset import AssetCube, AssetMesh
-from mi_nerfattack.commands.fit import Fit, _told_before
+from mi_nerfattack.commands.fit import Fit, _gap_warnings
 from mi_nerfattack.fields import GridField, load_field
 from mi_nerfattack.fields.io import load_grid
 from mi_nerfattack.fit import FitOptions, fit_grid, fit_ngp
@@ -60,7 +60,7 @@ def test_views_far_apart_are_told(apart_deg, warned):
     poses = np.stack([look_at(eye, np.zeros(3)) for eye in eyes])
     points = np.random.default_rng(0).uniform(-0.2, 0.2, (200, 3))
     images = replace(sphere_views(9)[0], camera_to_world=poses, points=points)
-    lines = list(_told_before(images))
+    lines = list(_gap_warnings(images))
     assert len(lines) == warned and all("40 degrees" in line for line in lines)
 
 
@@ -163,8 +163,8 @@ test_refused = refusals(
 @pytest.mark.slow
 def test_command_fits_a_folder(tmp_path, capsys):
     images, depth = sphere_views(9, alpha=False)
-    parts = images.images, images.camera, images.camera_to_world
-    write_transforms(tmp_path, *parts, {"depth_file": "depth.safetensors"})
+    arguments = images.images, images.camera, images.camera_to_world
+    write_transforms(tmp_path, *arguments, {"depth_file": "depth.safetensors"})
     files.write_safetensors(tmp_path / "depth.safetensors", {"depth": depth}, {})
     output = tmp_path / "field.safetensors"
     small = {"network": "small", "log2_table": 10, "max_resolution": 32}
@@ -222,8 +222,8 @@ def test_pictures_of_a_cube_come_out_again(tmp_path):
     np.testing.assert_allclose(faces.upper - faces.lower, 0.5)
     inner = np.ix_(np.r_[6:26, 38:58], np.r_[6:26, 38:58])
     for name, picture in pictures.items():
-        found = faces.images[name].astype(float)
-        assert found.shape == (64, 64, 4)
+        face = faces.images[name].astype(float)
+        assert face.shape == (64, 64, 4)
         if name != "nz":  # few views look at it from below
-            assert np.abs(found[..., :3] - picture)[inner].mean() < 20, name
-            assert found[inner][..., 3].mean() > 250
+            assert np.abs(face[..., :3] - picture)[inner].mean() < 20, name
+            assert face[inner][..., 3].mean() > 250

@@ -44,13 +44,13 @@ def test_batch_holds_the_rays_and_values_of_images_of_several_sizes(alpha):
         shown.append(images.images[i].reshape(len(ray), -1))
         known.append(depth[i].ravel())
         places.append(np.full(len(ray), place))
-    found = batch.colour.numpy().T
+    pixels = batch.colour.numpy().T
     if alpha:
-        found = np.c_[found, batch.alpha.numpy()]
+        pixels = np.c_[pixels, batch.alpha.numpy()]
     for value, expected, atol in (
         (batch.direction.numpy().T, rays, 1e-6),
         (batch.origin.numpy().T, eyes, 1e-6),
-        (255 * found, shown, 1e-4),
+        (255 * pixels, shown, 1e-4),
         (batch.depth.numpy(), known, 0),
         (batch.image.numpy(), places, 0),
     ):
@@ -76,8 +76,8 @@ def loss_reference(values: np.ndarray, ray: dict, weights: LossWeights) -> float
 
     shown = linear_to_srgb_numpy(radiance + (1 - opacity) * ray["background"])
     linear = ray["alpha"] * srgb_to_linear_numpy(ray["colour"])
-    wanted = linear_to_srgb_numpy(linear + (1 - ray["alpha"]) * ray["background"])
-    loss = penalty(shown - wanted, weights.huber).mean()
+    target = linear_to_srgb_numpy(linear + (1 - ray["alpha"]) * ray["background"])
+    loss = penalty(shown - target, weights.huber).mean()
     hit = np.isfinite(ray["depth"])
     if hit:
         loss += weights.depth * penalty(moment / ray["depth"] - 1, 0.1)
@@ -102,11 +102,11 @@ def test_cotangent_is_the_losss_derivative(depth, alpha):
     sky = mi.Color3f(sky.tolist())
     loss, _, cotangent = loss_and_cotangent(primal, sky, batch, weights, mi.Float(1))
     assert loss[0] == pytest.approx(loss_reference(values, ray, weights), rel=1e-3)
-    parts = (cotangent.radiance.numpy(), cotangent.opacity, cotangent.moment)
-    found = np.concatenate([np.ravel(part) for part in parts])
+    terms = (cotangent.radiance.numpy(), cotangent.opacity, cotangent.moment)
+    derivatives = np.concatenate([np.ravel(term) for term in terms])
     for i, step in enumerate(np.eye(5) * 1e-6):
         high, low = (loss_reference(values + s, ray, weights) for s in (step, -step))
-        assert found[i] == pytest.approx((high - low) / 2e-6, rel=2e-3, abs=1e-5)
+        assert derivatives[i] == pytest.approx((high - low) / 2e-6, rel=2e-3, abs=1e-5)
 
 
 def test_derivatives_where_depth_is_unknown_and_where_white_would_be_clipped():
@@ -115,18 +115,18 @@ def test_derivatives_where_depth_is_unknown_and_where_white_would_be_clipped():
     towards, colour = mi.Vector3f(0, 0, 1), mi.Color3f(0.5)
     batch = RayBatch(mi.Point3f(0), towards, colour, mi.Float(1), unknown)
     weights, black = LossWeights(depth=10.0, opacity=10.0), mi.Color3f(0)
-    loss, _, found = loss_and_cotangent(primal, black, batch, weights, mi.Float(1))
+    loss, _, cotangent = loss_and_cotangent(primal, black, batch, weights, mi.Float(1))
     assert np.isfinite(loss.numpy()).all()
-    assert found.radiance.numpy().min() > 0.1
-    for values in (found.opacity, found.moment):
+    assert cotangent.radiance.numpy().min() > 0.1
+    for values in (cotangent.opacity, cotangent.moment):
         assert (values.numpy() != 0).tolist() == [False, False, True]
 
 
 def test_bounds_around_the_point_that_cameras_look_at():
     images, depth = sphere_views(12)
     for known in (None, np.full_like(depth, np.nan)):
-        found = find_bounds(images, known)
-        np.testing.assert_allclose(found, [[-3.2] * 3, [3.2] * 3], atol=1e-6)
+        bounds = find_bounds(images, known)
+        np.testing.assert_allclose(bounds, [[-3.2] * 3, [3.2] * 3], atol=1e-6)
 
 
 def test_depth_and_given_bounds_win_over_points():
@@ -134,8 +134,8 @@ def test_depth_and_given_bounds_win_over_points():
     posed = replace(images, points=np.full((5, 3), 40.0))
     lower, upper = find_bounds(posed, depth)
     np.testing.assert_allclose(upper - lower, 2 * (RADIUS + 0.05), atol=0.02)
-    found = find_bounds(posed, depth, (0, 0, 0, 1, 2, 3))
-    np.testing.assert_array_equal(found, [[0, 0, 0], [1, 2, 3]])
+    bounds = find_bounds(posed, depth, (0, 0, 0, 1, 2, 3))
+    np.testing.assert_array_equal(bounds, [[0, 0, 0], [1, 2, 3]])
 
 
 def test_bounds_hold_a_step_of_the_march_behind_what_is_far():
@@ -158,8 +158,8 @@ def test_masked_pixels_are_not_drawn():
     images, masks = masked()
     bank = RayBank(replace(images, masks=masks), np.array([0, 1]))
     drawn = bank.draw(mi.PCG32(4000, 1)).numpy()
-    wanted = np.ravel_multi_index((1, 4, np.arange(5, 8)), (2, *masks.shape[1:]))
-    assert sorted(set(drawn.tolist())) == wanted.tolist()
+    expected = np.ravel_multi_index((1, 4, np.arange(5, 8)), (2, *masks.shape[1:]))
+    assert sorted(set(drawn.tolist())) == expected.tolist()
 
 
 def masked() -> tuple[PosedImages, np.ndarray]:

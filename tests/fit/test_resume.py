@@ -39,26 +39,26 @@ def options(**changes: object) -> FitOptions:
     return FitOptions(**settings | changes)
 
 
-def ngp(checkpoint: Path | None = None, **more) -> FitResult:
-    images, depth = more.pop("images", None) or sphere_views(8, alpha=False)
-    settings = options(**more.pop("changes", {}))
-    more |= {"step_m": 0.05, "cone": 0.0, "checkpoint": checkpoint}
-    return fit_ngp(images, *BOX, TINY_NGP, settings, depth, **more)
+def ngp(checkpoint: Path | None = None, **keywords) -> FitResult:
+    images, depth = keywords.pop("images", None) or sphere_views(8, alpha=False)
+    settings = options(**keywords.pop("changes", {}))
+    keywords |= {"step_m": 0.05, "cone": 0.0, "checkpoint": checkpoint}
+    return fit_ngp(images, *BOX, TINY_NGP, settings, depth, **keywords)
 
 
-def grid(checkpoint: Path | None = None, **more) -> FitResult:
+def grid(checkpoint: Path | None = None, **keywords) -> FitResult:
     images, depth = sphere_views(8)
-    settings = options(**more.pop("changes", {}))
-    more |= {"checkpoint": checkpoint}
-    return fit_grid(images, *BOX, TINY_GRID, settings, depth, **more)
+    settings = options(**keywords.pop("changes", {}))
+    keywords |= {"checkpoint": checkpoint}
+    return fit_grid(images, *BOX, TINY_GRID, settings, depth, **keywords)
 
 
-def interrupt(*arguments, **more) -> None:
+def interrupt(*arguments, **keywords) -> None:
     raise KeyboardInterrupt
 
 
 def stop_after(step: int, error: type[BaseException] = KeyboardInterrupt):
-    def progress(at, *more) -> None:
+    def progress(at, *arguments) -> None:
         if at.step >= step:
             raise error
 
@@ -68,14 +68,14 @@ def stop_after(step: int, error: type[BaseException] = KeyboardInterrupt):
 @pytest.mark.parametrize("fit", [ngp, grid])
 def test_resumed_fit_ends_where_the_whole_one_does(tmp_path, single_thread, fit):
     path = tmp_path / "fit.safetensors"
-    whole = fit()
+    uninterrupted = fit()
     with pytest.raises(KeyboardInterrupt):
         fit(path, progress=stop_after(50))
     assert path.is_file()
     result = fit(path)
-    assert result.steps == whole.steps == 100
+    assert result.steps == uninterrupted.steps == 100
     assert [at.step for at in result.history] == [25, 50, 75, 100]
-    for name, value in whole.field.tensors().items():
+    for name, value in uninterrupted.field.tensors().items():
         np.testing.assert_array_equal(result.field.tensors()[name], value, name)
 
 
@@ -98,8 +98,10 @@ def test_killed_fit_goes_on_from_what_was_saved_on_the_way(tmp_path, monkeypatch
         ngp(path, progress=stop_after(75, RuntimeError))
     result = ngp(path)
     assert [at.step for at in result.history] == [25, 50, 75, 100]
-    whole = ngp()
-    assert result.psnr_heldout_db == pytest.approx(whole.psnr_heldout_db, abs=0.5)
+    uninterrupted = ngp()
+    assert result.psnr_heldout_db == pytest.approx(
+        uninterrupted.psnr_heldout_db, abs=0.5
+    )
     times = [at.elapsed_s for at in result.history]
     assert times == sorted(times)
 

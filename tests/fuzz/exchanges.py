@@ -83,8 +83,8 @@ def answers(folder: Path) -> Targets:
         "chunks": b"Transfer-Encoding: chunked",
     }
     for name, head in heads.items():
-        parts = body[:9], len(body) - 9, body[9:]
-        chunks = b"9\r\n%s\r\n%x;a=b\r\n%s\r\n0\r\n\r\n" % parts
+        pieces = body[:9], len(body) - 9, body[9:]
+        chunks = b"9\r\n%s\r\n%x;a=b\r\n%s\r\n0\r\n\r\n" % pieces
         raw = b"HTTP/1.1 200 OK\r\n" + head + b"\r\n\r\n"
         raw += chunks if name == "chunks" else body
         (folder / f"{name}.http").write_bytes(raw)

@@ -201,8 +201,8 @@ def _png(folder: Path) -> list[tuple[Path, Read]]:
     Image.fromarray(picture[..., 0]).save(folder / "grey.png", transparency=3)
     Image.fromarray(picture[..., 0].astype(np.uint16) * 99).save(folder / "deep.png")
     names = ("rgba.png", "palette.png", "grey.png")
-    found: list[tuple[Path, Read]] = [(folder / n, files.read_image) for n in names]
-    return [*found, (folder / "deep.png", files.read_image16)]
+    targets: list[tuple[Path, Read]] = [(folder / n, files.read_image) for n in names]
+    return [*targets, (folder / "deep.png", files.read_image16)]
 
 
 def _jpeg(folder: Path) -> list[tuple[Path, Read]]:
@@ -242,12 +242,12 @@ def _transforms(folder: Path) -> list[tuple[Path, Read]]:
         images = read_images(path.parent, skip_missing=True)
         read_depth(path.parent, images)
 
-    found: list[tuple[Path, Read]] = []
+    targets: list[tuple[Path, Read]] = []
     for make in (foreign_folders.nerfstudio, foreign_folders.instant_ngp):
         sub = folder / make.__name__
         sub.mkdir()
-        found.append((make(sub) / "transforms.json", read))
-    return [*found, (found[0][0], read_path)]
+        targets.append((make(sub) / "transforms.json", read))
+    return [*targets, (targets[0][0], read_path)]
 
 
 def _colmap(folder: Path, suffix: str = ".bin") -> list[tuple[Path, Read]]:

@@ -89,28 +89,28 @@ def number_bytes(rng: random.Random) -> bytes:
 def of_text(rng: random.Random, raw: bytes) -> bytes:
     kind = rng.randrange(6)
     if kind < 4:
-        found = list(_TOKEN.finditer(raw))
-        if not found:
+        tokens = list(_TOKEN.finditer(raw))
+        if not tokens:
             return raw + b"x"
-        token = rng.choice(found)
-        return raw[: token.start()] + _token(rng, token[0], found) + raw[token.end() :]
+        token = rng.choice(tokens)
+        return raw[: token.start()] + _token(rng, token[0], tokens) + raw[token.end() :]
     lines = raw.splitlines(keepends=True) or [b""]
     i, j = rng.randrange(len(lines)), rng.randrange(len(lines))
     if kind == 4:
         line = lines[i]
         lines[i : i + 1] = rng.choice(([], [line] * 2, [lines[j]], [line] * 500))
     else:
-        more = (b"[" * 5000, b"{", b"\0", b"\xff", b"x = 1\n", b"=")
-        lines.insert(i, rng.choice(more))
+        insertions = (b"[" * 5000, b"{", b"\0", b"\xff", b"x = 1\n", b"=")
+        lines.insert(i, rng.choice(insertions))
     return b"".join(lines)
 
 
-def _token(rng: random.Random, old: bytes, found: list[re.Match[bytes]]) -> bytes:
+def _token(rng: random.Random, old: bytes, tokens: list[re.Match[bytes]]) -> bytes:
     kind = rng.randrange(5)
     if kind == 0:
         return b""
     if kind == 1:
-        return rng.choice(found)[0]
+        return rng.choice(tokens)[0]
     if kind == 2:
         return rng.choice(NUMBERS).encode()
     if kind == 3 and old[:1] == b'"':
@@ -175,10 +175,10 @@ def of_tensors(rng: random.Random, raw: bytes) -> bytes:
     if kind == 0:
         change(rng, header)
     elif kind == 1 and header.get("__metadata__"):
-        about = header["__metadata__"]
-        key = rng.choice(list(about))
-        text = of_text(rng, about[key].encode()).decode("utf-8", "replace")
-        about[key] = rng.choice((text, *STRINGS))
+        metadata = header["__metadata__"]
+        key = rng.choice(list(metadata))
+        text = of_text(rng, metadata[key].encode()).decode("utf-8", "replace")
+        metadata[key] = rng.choice((text, *STRINGS))
     elif kind == 2:
         rng.shuffle(entry["shape"])
         entry["shape"] += [1] * rng.choice((0, 1, 70))

@@ -140,9 +140,9 @@ def policies(folder: Path) -> list[tuple[Path, Any]]:
     torch.set_num_threads(1)
     net = PilotNet()
     net.save(folder / "whole.safetensors")
-    _, about = files.read_safetensors(folder / "whole.safetensors")
+    _, metadata = files.read_safetensors(folder / "whole.safetensors")
     tensors = {name: np.zeros(1, np.float32) for name in net.state_dict()}
-    files.write_safetensors(folder / "pilotnet.safetensors", tensors, about)
+    files.write_safetensors(folder / "pilotnet.safetensors", tensors, metadata)
     (folder / "whole.safetensors").unlink()
     module = torch.nn.Linear(3, 2)
     state = {name: value.detach() for name, value in module.state_dict().items()}
@@ -275,7 +275,7 @@ def scenes(folder: Path) -> list[tuple[Path, Any]]:
 
     save_field(folder / "field.safetensors", blob(np.random.default_rng(0)))
     four_colours().save(folder / "four.png")
-    more = """<shape type="cube"><bsdf type="diffuse">
+    elements = """<shape type="cube"><bsdf type="diffuse">
     <texture type="bitmap" name="reflectance">
     <string name="filename" value="four.png"/></texture></bsdf></shape>
     <default name="spp" value="4"/>
@@ -288,7 +288,7 @@ def scenes(folder: Path) -> list[tuple[Path, Any]]:
     <string name="filename" value="field.safetensors"/></volume></emitter></shape>
     </scene>"""
     path = folder / "scene.xml"
-    path.write_text(SCENE.replace("</scene>", more))
+    path.write_text(SCENE.replace("</scene>", elements))
 
     def read(path: Path) -> None:
         scene_files(path)
@@ -321,9 +321,9 @@ def checkpoints(folder: Path) -> list[tuple[Path, Any]]:
     store.add(spec, Drive("surrogate", "line", "attack", 0, 0, *rows), 1.0)
 
     def read(path: Path) -> None:
-        kept = CheckpointFile(path, {"a": "1"})
-        kept.read()
-        kept.restore(attack)
+        checkpoint = CheckpointFile(path, {"a": "1"})
+        checkpoint.read()
+        checkpoint.restore(attack)
 
     return [(path, read), (store.path(spec), read_drive)]
 

@@ -56,14 +56,14 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", type=int, help="one input, with its traceback")
     parser.add_argument("--keep", type=Path, help="folder for the inputs that fail")
-    given = parser.parse_args()
-    single = given.only is not None
-    several = range(given.first, given.first + given.count)
-    numbers = [given.only] if single else several
-    jobs = [(name, number) for name in given.formats for number in numbers]
-    failures = fuzz(Plan(jobs, given.seed, single, given.keep))
-    for (name, kind), found in failures.items():
-        print(f"{name}: {len(found)} inputs, as --only {found[0]}: {kind}")
+    arguments = parser.parse_args()
+    single = arguments.only is not None
+    several = range(arguments.first, arguments.first + arguments.count)
+    numbers = [arguments.only] if single else several
+    jobs = [(name, number) for name in arguments.formats for number in numbers]
+    failures = fuzz(Plan(jobs, arguments.seed, single, arguments.keep))
+    for (name, kind), inputs in failures.items():
+        print(f"{name}: {len(inputs)} inputs, as --only {inputs[0]}: {kind}")
     return int(bool(failures))
 
 
@@ -93,7 +93,7 @@ def fuzz(plan: Plan) -> dict[tuple[str, str], list[int]]:
 
 def _watch(child: int, shared: mmap.mmap) -> str:
     """Wait for the end of a child; say how it ended where it was not by itself."""
-    seen, since, spent = b"", 0.0, 0.0
+    last, since, spent = b"", 0.0, 0.0
     while True:
         pid, status = os.waitpid(child, os.WNOHANG)
         if pid:
@@ -101,9 +101,9 @@ def _watch(child: int, shared: mmap.mmap) -> str:
             ending = f"signal {signal.Signals(-code).name}" if code < 0 else ""
             return ending or (f"exit code {code}" if code else "")
         used = _cpu_seconds(child)
-        if shared[:] != seen:
-            seen, since, spent = shared[:], time.monotonic(), used
-        elif seen[8] and (used - spent > SECONDS or time.monotonic() > since + WAITING):
+        if shared[:] != last:
+            last, since, spent = shared[:], time.monotonic(), used
+        elif last[8] and (used - spent > SECONDS or time.monotonic() > since + WAITING):
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
             return f"more than {SECONDS:g} s, or waits"

@@ -199,9 +199,9 @@ def test_an_ngp_of_three_features(tmp_path, variant):
 
     path = tmp_path / "a.safetensors"
     save_field(path, small_ngp())
-    tensors, about = files.read_safetensors(path)
+    tensors, metadata = files.read_safetensors(path)
     for features in ("1", "3", "5", "6"):
-        files.write_safetensors(path, tensors, {**about, "features": features})
+        files.write_safetensors(path, tensors, {**metadata, "features": features})
         refused(load_field, path, f"features: {features}; allowed are")
 
 

@@ -95,8 +95,8 @@ def test_what_is_not_written(tmp_path, layers, metadata, message):
 
 
 def two_parts(path):
-    parts = [OpenEXR.Part({}, {"Z": np.ones((4, 4), np.float32)}, n) for n in "ab"]
-    OpenEXR.File(parts).write(str(path))
+    exr_parts = [OpenEXR.Part({}, {"Z": np.ones((4, 4), np.float32)}, n) for n in "ab"]
+    OpenEXR.File(exr_parts).write(str(path))
 
 
 def huge(path):

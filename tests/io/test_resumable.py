@@ -31,10 +31,10 @@ def unit(path, **changes) -> Unit[Note]:
 def test_unit_reads_back_what_was_written(tmp_path):
     assert unit(tmp_path).read() is None and unit(tmp_path).read_record() is None
     unit(tmp_path).write(TENSORS, NOTE)
-    kept = unit(tmp_path).read()
-    assert kept is not None and kept.record == NOTE and not kept.ignored
+    content = unit(tmp_path).read()
+    assert content is not None and content.record == NOTE and not content.ignored
     for name, value in TENSORS.items():
-        np.testing.assert_array_equal(kept.tensors[name], value, strict=True)
+        np.testing.assert_array_equal(content.tensors[name], value, strict=True)
     assert unit(tmp_path).read_record() == NOTE
 
 
@@ -44,8 +44,8 @@ def test_unit_of_something_else_is_refused_with_all_differences(tmp_path):
     for read in (other.read, other.read_record):
         with pytest.raises(InputError, match=r"seed: 1 -> 2\n .*width: 3 -> 4\n"):
             read()
-    kept = other.read(force=True)
-    assert kept is not None and len(kept.ignored) == 2
+    content = other.read(force=True)
+    assert content is not None and len(content.ignored) == 2
     with pytest.raises(InputError, match="'test 1', .* 'test 2'"):
         unit(tmp_path, format="test 2").read(force=True)
 
@@ -65,10 +65,10 @@ def test_differences_are_told_key_by_key():
     def file(name, digest):
         return json.dumps({"file": name, "sha256": digest})
 
-    kept = {"same": "1", "gone": "2", "moved": file("a", "1"), "new": file("b", "1")}
+    stored = {"same": "1", "gone": "2", "moved": file("a", "1"), "new": file("b", "1")}
     present = {"same": "1", "moved": file("z", "1"), "new": file("b", "2"), "add": "3"}
-    found = [line.partition(":")[0] for line in differences(kept, present)]
-    assert found == ["new", "add", "gone"]
+    keys = [line.partition(":")[0] for line in differences(stored, present)]
+    assert keys == ["new", "add", "gone"]
 
 
 def test_a_second_worker_is_refused_or_waits(tmp_path):

@@ -46,28 +46,28 @@ class Change:
         return (data[: self.start] + self.after.encode() + data[self.end :]).decode()
 
 
-def draw(root: Path, parts: Sequence[str], count: int, seed: int) -> list[Change]:
+def draw(root: Path, folders: Sequence[str], count: int, seed: int) -> list[Change]:
     """Draw changes of files under some folders, each as likely as any other."""
-    found: list[Change] = []
-    for part in parts:
-        base = root / part
+    candidates: list[Change] = []
+    for folder in folders:
+        base = root / folder
         for path in sorted(base.rglob("*.py")) if base.is_dir() else [base]:
-            found += changes(path.relative_to(root).as_posix(), path.read_text())
-    return random.Random(seed).sample(found, min(count, len(found)))
+            candidates += changes(path.relative_to(root).as_posix(), path.read_text())
+    return random.Random(seed).sample(candidates, min(count, len(candidates)))
 
 
 def changes(path: str, source: str) -> list[Change]:
     starts = [0]
     for text in source.encode().splitlines(keepends=True):
         starts.append(starts[-1] + len(text))
-    found: list[Change] = []
+    candidates: list[Change] = []
     for node, kind, after in _nodes(ast.parse(source)):
         assert node.end_lineno is not None and node.end_col_offset is not None
         start = starts[node.lineno - 1] + node.col_offset
         end = starts[node.end_lineno - 1] + node.end_col_offset
         before = source.encode()[start:end].decode()
-        found.append(Change(path, node.lineno, kind, start, end, before, after))
-    return found
+        candidates.append(Change(path, node.lineno, kind, start, end, before, after))
+    return candidates
 
 
 def _nodes(node: ast.AST) -> Iterator[tuple[_Node, str, str]]:

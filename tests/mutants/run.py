@@ -33,7 +33,7 @@ from mi_nerfattack.io import files
 ROOT = Path(__file__).parents[2]
 WORK = ROOT / "build" / "mutants"
 PACKAGE = "mi_nerfattack"
-PARTS = "rollout render evaluation drives attack car/drive/safety car/vesc".split()
+FOLDERS = "rollout render evaluation drives attack car/drive/safety car/vesc".split()
 #: Of tests of one change, as they were measured, and of one run beside others.
 SECONDS, LIMIT_S = 60.0, 600.0
 #: A change and its row of the table.
@@ -46,42 +46,42 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=400)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=os.cpu_count())
-    parser.add_argument("--parts", nargs="*", default=PARTS)
+    parser.add_argument("--parts", nargs="*", default=FOLDERS)
     parser.add_argument("--again", action="store_true")
     parser.add_argument("--tests", nargs="*", help="judge by these, without measuring")
     parser.add_argument("--table", type=Path, default=WORK / "changes.csv")
-    given = parser.parse_args()
-    rows = _read(given.table)
+    arguments = parser.parse_args()
+    rows = _read(arguments.table)
     code = _hash("")
-    if given.again:
-        waiting = _again(rows, None if given.tests else code)
+    if arguments.again:
+        waiting = _again(rows, None if arguments.tests else code)
     else:
-        drawn = draw(ROOT / PACKAGE, given.parts, given.count, given.seed)
+        drawn = draw(ROOT / PACKAGE, arguments.parts, arguments.count, arguments.seed)
         done = {(*_key(row), row["line"]) for row in rows}
         waiting = [
-            (change, {"seed": str(given.seed)})
+            (change, {"seed": str(arguments.seed)})
             for change in drawn
             if (*_key(vars(change)), str(change.line)) not in done
         ]
-    measured = None if given.tests else Measured()
+    measured = None if arguments.tests else Measured()
     trees: SimpleQueue[Path] = SimpleQueue()
-    for number in range(given.workers):
+    for number in range(arguments.workers):
         trees.put(_copied(WORK / f"tree_{number}"))
 
     def judged(change: Change) -> tuple[str, str]:
-        tests = measured.tests(change, given.again) if measured else given.tests
+        tests = measured.tests(change, arguments.again) if measured else arguments.tests
         return _judge(change, tests, trees)
 
-    with ThreadPoolExecutor(given.workers) as pool:
+    with ThreadPoolExecutor(arguments.workers) as pool:
         outcomes = pool.map(judged, [change for change, _ in waiting])
         for (change, row), (outcome, test) in zip(waiting, outcomes, strict=True):
-            if not given.again:
+            if not arguments.again:
                 rows.append(row)
             columns = ("path", "line", "kind", "before", "after")
             row |= {"outcome": outcome, "test": test, "code": code}
             row["reason"] = row.get("reason", "") * (outcome != "noticed")
             row |= {name: str(getattr(change, name)) for name in columns}
-            files.write_text(given.table, pd.DataFrame(rows).to_csv(index=False))
+            files.write_text(arguments.table, pd.DataFrame(rows).to_csv(index=False))
             print(f"{outcome} {change.path}:{change.line}", flush=True)
     _print(rows)
     return 0
@@ -94,7 +94,7 @@ def _again(rows: list[dict[Any, Any]], code: str | None) -> list[_Judged]:
         rows: of the table.
         code: whose rows need not be judged again, if any.
     """
-    found: list[_Judged] = []
+    waiting: list[_Judged] = []
     for row in rows:
         path = ROOT / PACKAGE / row["path"]
         if row["outcome"] == "noticed" or row["code"] == code or not path.exists():
@@ -102,8 +102,8 @@ def _again(rows: list[dict[Any, Any]], code: str | None) -> list[_Judged]:
         same = [c for c in changes(row["path"], path.read_text()) if _same(c, row)]
         if same:
             line = int(row["line"])
-            found.append((min(same, key=lambda c: abs(c.line - line)), row))
-    return found
+            waiting.append((min(same, key=lambda c: abs(c.line - line)), row))
+    return waiting
 
 
 def _same(change: Change, row: dict[Any, Any]) -> bool:
@@ -252,10 +252,10 @@ def _print(rows: list[dict[Any, Any]]) -> None:
         if row["outcome"] != "noticed":
             print(f"{row['path']}:{row['line']} {row['outcome']} {row['reason']}")
             print(f"    {row['before']}\n    {row['after']}")
-    for part in PARTS:
-        own = [row for row in rows if row["path"].startswith(part)]
+    for folder in FOLDERS:
+        own = [row for row in rows if row["path"].startswith(folder)]
         counts = Counter(row["outcome"] for row in own)
-        print(f"{part}: {counts['noticed']} of {len(own)} noticed")
+        print(f"{folder}: {counts['noticed']} of {len(own)} noticed")
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ import ast
 
 import pytest
 from mutants.changes import changes, draw
-from mutants.run import PACKAGE, PARTS, ROOT
+from mutants.run import FOLDERS, PACKAGE, ROOT
 
 
 @pytest.mark.parametrize(
@@ -37,10 +37,12 @@ def test_what_is_changed(source, expected):
 
 
 def test_every_change_of_the_package_is_code_and_no_other_line_differs():
-    first, again, other = (draw(ROOT / PACKAGE, PARTS, 200, seed) for seed in (0, 0, 1))
+    first, again, other = (
+        draw(ROOT / PACKAGE, FOLDERS, 200, seed) for seed in (0, 0, 1)
+    )
     assert first == again != other
     for change in first:
         source = (ROOT / PACKAGE / change.path).read_text()
-        applied, kept = change.applied(source), change.line - 1
+        applied, index = change.applied(source), change.line - 1
         assert ast.unparse(ast.parse(applied)) != ast.unparse(ast.parse(source))
-        assert applied.splitlines()[:kept] == source.splitlines()[:kept]
+        assert applied.splitlines()[:index] == source.splitlines()[:index]

@@ -37,9 +37,9 @@ def grid(tmp_path: Path, variant: str, rng: np.random.Generator) -> dict[str, An
     return {"type": "grid_field", "filename": str(tmp_path / "grid.safetensors")}
 
 
-def scene(grid: dict, more: dict | None = None, **film: Any) -> mi.Scene:
+def scene(grid: dict, entries: dict | None = None, **film: Any) -> mi.Scene:
     """Load a scene with a field_integrator."""
-    nested = {"object": grid, **(more or {})}
+    nested = {"object": grid, **(entries or {})}
     return load(nested, **{**VIEW, **SIZE, **film})
 
 
@@ -66,8 +66,8 @@ def check_derivatives(loaded, rng, channels: int, **view: Any) -> None:
             seeds = {"seed": 3}
         return mi.render(loaded, params, spp=2, **seeds, **view)[..., :channels]
 
-    found = Derivatives(params, key, output)
-    found.check([rng.normal(0, 1, found.base.shape)])
+    derivatives = Derivatives(params, key, output)
+    derivatives.check([rng.normal(0, 1, derivatives.base.shape)])
 
 
 @pytest.mark.parametrize("eye", [(3, 1, 0.5), (-0.4, 0.2, 0.1)], ids=["out", "in"])
@@ -75,12 +75,12 @@ def test_integrator_shows_the_march(grid, eye) -> None:
     loaded = scene(grid, {"aovs": True}, eye=eye)
     image = shown(loaded, 1, seed=0)
     ray = small.first_rays(loaded)
-    seen = march(PosedField(load_field(grid["filename"])), Rays(ray.o, ray.d), 0.0)
-    expected = 2 * [*seen.radiance, seen.opacity, seen.depth]
+    integrals = march(PosedField(load_field(grid["filename"])), Rays(ray.o, ray.d), 0.0)
+    expected = 2 * [*integrals.radiance, integrals.opacity, integrals.depth]
     assert image.shape == (9, 14, 10)
     for channel, values in enumerate(expected):
-        found = image[..., channel].ravel()
-        np.testing.assert_allclose(found, values.numpy(), rtol=1e-3, atol=1e-5)
+        pixels = image[..., channel].ravel()
+        np.testing.assert_allclose(pixels, values.numpy(), rtol=1e-3, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -93,12 +93,12 @@ def test_filters_and_crops_are_those_of_the_path_tracer(
 ) -> None:
     film = {"rfilter": {"type": rfilter}, "sample_border": rfilter == "gaussian"}
     loaded = scene(grid, **film, **window)
-    found, expected = (
+    actual, expected = (
         shown(x, 3, seed=5) for x in (loaded, stock(grid, **film, **window))
     )
     assert expected.shape[:2] == ((5, 7) if window else (9, 14))
     assert expected.std() > 0.01
-    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(actual, expected, rtol=1e-3, atol=1e-4)
     check_derivatives(loaded, rng, 3)
 
 
@@ -208,14 +208,14 @@ def test_emitter_sampling_agrees_with_bsdf_sampling(
     bright: Path, shape: str, integrator: dict, inside: bool
 ) -> None:
     expected, noise = estimate(lit_scene(bright, shape, BY_BSDF, inside), 512)
-    found, other = estimate(lit_scene(bright, shape, integrator, inside), 512)
+    actual, other = estimate(lit_scene(bright, shape, integrator, inside), 512)
     assert expected.mean() > 1e-3
-    error = (found - expected) / np.sqrt(noise**2 + other**2 + 1e-12)
+    error = (actual - expected) / np.sqrt(noise**2 + other**2 + 1e-12)
     # Student's t with about 30 degrees of freedom, over 144 values.
     assert np.abs(error).max() < 6
     # Channels share their noise, pixels do not.
     bound = 5 * np.sqrt((noise**2 + other**2).mean() / (WIDTH * HEIGHT))
-    assert abs(found.mean() - expected.mean()) < bound < 0.15 * expected.mean()
+    assert abs(actual.mean() - expected.mean()) < bound < 0.15 * expected.mean()
 
 
 @pytest.mark.parametrize(
@@ -243,13 +243,13 @@ def test_sampled_directions_carry_their_density(bright: Path, shape: str, eye) -
     ray = mi.Ray3f(it.p, around)
     ray.wavelengths = it.wavelengths
     si = loaded.ray_intersect(ray)
-    seen = np.array(si.emitter(loaded).eval(si)) * 4 * np.pi
+    from_sphere = np.array(si.emitter(loaded).eval(si)) * 4 * np.pi
     # From outside, a line meets a convex shape twice, and both points are sampled.
     front = np.array(dr.dot(ds.n, ds.d)) < 0 if max(eye) > 1 else 1
-    found = np.array(weight) * front
-    noise = np.sqrt((seen.var(1) + found.var(1)) / seen.shape[1])
-    assert (noise < 0.05 * seen.mean(1)).all()
-    assert (np.abs(found.mean(1) - seen.mean(1)) < 4 * noise).all()
+    from_emitter = np.array(weight) * front
+    noise = np.sqrt((from_sphere.var(1) + from_emitter.var(1)) / from_sphere.shape[1])
+    assert (noise < 0.05 * from_sphere.mean(1)).all()
+    assert (np.abs(from_emitter.mean(1) - from_sphere.mean(1)) < 4 * noise).all()
 
 
 def test_light_tracing_from_the_emitter_is_refused(bright: Path) -> None:

@@ -76,12 +76,12 @@ class Case:
         return float(dr.grad(number)[0])
 
     def check(self, step: float = 1e-2, rel: float = 1e-2) -> None:
-        found = self.gradient()
+        derivative = self.gradient()
         expected = central_difference(
             lambda s: float(dr.detach(self.value(mi.Float(s))).array[0]), step
         )
         assert abs(expected) > 1e-4, "the loss does not depend on it"
-        assert found == pytest.approx(expected, rel=rel)
+        assert derivative == pytest.approx(expected, rel=rel)
 
 
 def pattern(image: Any, first: int = 0, channels: int = 3, where: Any = True) -> Any:
@@ -273,8 +273,8 @@ def test_forward_mode_in_every_habit(blob, habit, name) -> None:
     else:
         dr.set_grad(params[key], 1)
         dr.forward_to(loss)
-    found = float(dr.grad(loss).array[0])
-    assert found == pytest.approx(expected, rel=1e-3)
+    derivative = float(dr.grad(loss).array[0])
+    assert derivative == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize(

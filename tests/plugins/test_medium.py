@@ -104,14 +104,14 @@ def test_a_changed_density_reaches_the_medium(path: Path) -> None:
 
 
 def test_a_limit_cuts_density_and_majorant(path: Path, rng) -> None:
-    whole = mi.load_dict(own(path))
+    unlimited = mi.load_dict(own(path))
     cut = mi.load_dict({**own(path), "density_limit": 1.0})
     it = dr.zeros(mi.Interaction3f, 1000)
     it.p = mi.Point3f(rng.uniform(-1, 1, (3, 1000)).astype(np.float32))
-    expected = np.minimum(whole.eval_1(it).numpy(), 1)
+    expected = np.minimum(unlimited.eval_1(it).numpy(), 1)
     assert 0.1 < (expected == 1).mean() < 0.9
     np.testing.assert_array_equal(cut.eval_1(it).numpy(), expected)
-    assert cut.max() == 1 < whole.max()
+    assert cut.max() == 1 < unlimited.max()
 
 
 def gradients(loaded: mi.Scene, suffixes: tuple[str, ...]) -> list[np.ndarray]:
@@ -161,7 +161,7 @@ def test_gradients_are_those_of_gridvolume_by_the_chain_rule(path: Path) -> None
     by_texture = not mi.is_spectral
     loaded = scene(own(path), albedos[0], "prbvolpath")
     names = ("sigma_t.density", "albedo.colour")[: 1 + by_texture]
-    found = gradients(loaded, names)
+    actual = gradients(loaded, names)
     loaded = scene(density, albedos[1], "prbvolpath")
     names = ("sigma_t.data", "albedo.data")[: 1 + by_texture]
     values = gradients(loaded, names)
@@ -172,7 +172,7 @@ def test_gradients_are_those_of_gridvolume_by_the_chain_rule(path: Path) -> None
     field = load_field(path)
     expected = weight @ (values[0].ravel() * small.eval_grid(field, vertices())[0])
     scale = np.abs(expected).max()
-    np.testing.assert_allclose(found[0], expected, atol=1e-3 * scale)
+    np.testing.assert_allclose(actual[0], expected, atol=1e-3 * scale)
     if by_texture:
         raw = field.texture.numpy().astype(float)
         h = 1e-5
@@ -182,4 +182,4 @@ def test_gradients_are_those_of_gridvolume_by_the_chain_rule(path: Path) -> None
         colour = 1 / (1 + np.exp(-raw))
         expected /= colour * (1 - colour)
         scale = np.abs(expected).max()
-        np.testing.assert_allclose(found[1], expected, atol=1e-3 * scale)
+        np.testing.assert_allclose(actual[1], expected, atol=1e-3 * scale)

@@ -60,9 +60,9 @@ def test_a_texture_set_in_python_shows_in_the_parameters(blob, rng) -> None:
     # The values from before are a change, which Mitsuba must not leave out.
     params[KEY] = original
     params.update()
-    found = field.texture.numpy()
-    np.testing.assert_allclose(found[finest], logit(original.numpy()), atol=1e-3)
-    assert not np.delete(found, np.r_[finest], 0).any()
+    texture = field.texture.numpy()
+    np.testing.assert_allclose(texture[finest], logit(original.numpy()), atol=1e-3)
+    assert not np.delete(texture, np.r_[finest], 0).any()
 
 
 @pytest.mark.parametrize("value", [np.nan, 1.0])
@@ -122,10 +122,10 @@ MASK = {"type": "mask", "opacity": 0.0, "bsdf": {"type": "diffuse"}}
 def test_surfaces_that_light_passes_hide_no_field(blob, is_mask, nested) -> None:
     expected = shown(load({"a": blob, "aovs": True}))[..., 3]
     assert expected.max() > 0.3
-    more = pane(MASK if is_mask else {"type": "thindielectric"})
+    entries = pane(MASK if is_mask else {"type": "thindielectric"})
     if not is_mask:
-        more["fog"] = {**FOG, "to_world": T().scale(1.5)}
-    scene = load({"a": blob, "aovs": True, **nested}, more)
+        entries["fog"] = {**FOG, "to_world": T().scale(1.5)}
+    scene = load({"a": blob, "aovs": True, **nested}, entries)
     np.testing.assert_allclose(shown(scene)[..., 3], expected, atol=1e-5)
 
 
@@ -138,9 +138,9 @@ def test_alpha_is_the_opacity(blob) -> None:
     np.testing.assert_allclose(image[..., 3], image[..., 4], atol=1e-6)
     assert image[..., 3].min() < 1e-9 and 0.3 < image[..., 3].max() < 1
     # over the surfaces that a nested integrator hits
-    nested, more = {"a": blob, "behind": {"type": "path"}}, {"floor": floor()}
-    behind = shown(load(nested, more))
-    wide = shown(load(nested, more, pixel_format="rgba"))
+    nested, entries = {"a": blob, "behind": {"type": "path"}}, {"floor": floor()}
+    behind = shown(load(nested, entries))
+    wide = shown(load(nested, entries, pixel_format="rgba"))
     assert (wide[-1, :, 3] == 1).all()
     np.testing.assert_allclose(wide[0, :, 3], image[0, :, 4], atol=1e-6)
     np.testing.assert_allclose(wide[..., :3], behind, atol=1e-6)
@@ -203,17 +203,17 @@ def test_images_and_derivatives_through_stock_integrators(blob, kind, aovs) -> N
 
     expected = differentiated(inside)
     assert len(expected) == 4 and all(np.abs(part).max() > 1e-4 for part in expected)
-    found = differentiated(around)
-    np.testing.assert_allclose(found[0], expected[0], atol=1e-5)
-    for part, wanted in zip(found[1:], expected[1:], strict=True):
-        np.testing.assert_allclose(part, wanted, rtol=1e-3, atol=1e-6)
+    actual = differentiated(around)
+    np.testing.assert_allclose(actual[0], expected[0], atol=1e-5)
+    for part, reference in zip(actual[1:], expected[1:], strict=True):
+        np.testing.assert_allclose(part, reference, rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.parametrize("aovs", [False, True])
 def test_channels_of_a_nested_aov_come_last(blob, aovs: bool) -> None:
     behind = {"type": "aov", "aovs": "nn:sh_normal", "img": {"type": "path"}}
-    more = {"floor": floor(), "light": {"type": "constant"}}
-    scene = load({"a": blob, "aovs": aovs, "behind": behind}, more)
+    entries = {"floor": floor(), "light": {"type": "constant"}}
+    scene = load({"a": blob, "aovs": aovs, "behind": behind}, entries)
     names = scene.integrator().aov_names()
     assert names[-3:] == ["nn.X", "nn.Y", "nn.Z"]
     image = shown(scene)
@@ -233,9 +233,9 @@ def test_a_recorded_function_renders_what_changed(blob, nested) -> None:
     recorded = dr.freeze(lambda scene: mi.render(scene, spp=4, seed=1))
 
     def check() -> np.ndarray:
-        found = np.array(recorded(scene))
-        np.testing.assert_allclose(found, shown(scene), atol=1e-6)
-        return found
+        image = np.array(recorded(scene))
+        np.testing.assert_allclose(image, shown(scene), atol=1e-6)
+        return image
 
     images = [check(), check()]
     recordings = recorded.n_recordings

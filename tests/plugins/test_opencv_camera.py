@@ -36,16 +36,16 @@ def local(direction: Any) -> np.ndarray:
 @LENSES
 @pytest.mark.parametrize("crop", [{}, cams.CROP], ids=["full", "crop"])
 def test_rays_and_differentials_look_where_the_lens_says(camera, crop) -> None:
-    found = made(camera, **crop)
-    back, pose = from_mitsuba(found)
+    loaded = made(camera, **crop)
+    back, pose = from_mitsuba(loaded)
     np.testing.assert_allclose(back.distortion, camera.distortion, rtol=1e-6)
     np.testing.assert_allclose(pose, POSE, atol=1e-6)
     u, v = cams.pixels(camera)
-    ray, _ = cams.rays(found, np.stack([u, v], 1))
+    ray, _ = cams.rays(loaded, np.stack([u, v], 1))
     expected = cams.directions(camera, u, v)
     np.testing.assert_allclose(local(ray.d), expected, atol=3e-6)
     # Rays start at the near plane, of a fisheye on a sphere.
-    offset = local(ray.o - found.world_transform().translation())
+    offset = local(ray.o - loaded.world_transform().translation())
     reach = np.linalg.norm(offset, axis=1) if camera.is_fisheye else offset[:, 2]
     np.testing.assert_allclose(reach, 1e-2, rtol=1e-4)
     for there, (a, b) in ((ray.d_x, (1, 0)), (ray.d_y, (0, 1))):
@@ -65,12 +65,12 @@ def test_rays_and_differentials_look_where_the_lens_says(camera, crop) -> None:
 @LENSES
 def test_points_are_connected_to_the_pixels_that_show_them(camera) -> None:
     corner, size = np.array([15.0, 7.0]), np.array([20, 16])
-    found = made(camera, **cams.CROP)
+    loaded = made(camera, **cams.CROP)
     place = corner + np.random.default_rng(1).uniform(0.02, 0.98, (200, 2)) * size
-    ray, _ = cams.rays(found, place)
+    ray, _ = cams.rays(loaded, place)
     it = dr.zeros(mi.Interaction3f, 200)
     it.p = ray(mi.Float(2.5))
-    ds, weight = found.sample_direction(it, mi.Point2f(0))
+    ds, weight = loaded.sample_direction(it, mi.Point2f(0))
     assert np.all(np.array(ds.pdf) == 1)
     np.testing.assert_allclose(ds.uv.numpy().T, place - corner, atol=2e-3)
     np.testing.assert_allclose(ds.d.numpy(), -ray.d.numpy(), atol=1e-5)
@@ -92,11 +92,11 @@ def test_points_that_fold_into_the_image_are_not_seen() -> None:
     folding = {"type": "opencv_camera", "fx": 60.0, "k1": -0.1}
     it = dr.zeros(mi.Interaction3f, 1)
     camera = cams.load({**folding, "film": cams.film()})
-    for x, seen in ((0.29, True), (3.0, False)):
+    for x, is_visible in ((0.29, True), (3.0, False)):
         it.p = mi.Point3f(x, 0, 1)
         ds, weight = camera.sample_direction(it, mi.Point2f(0))
         assert abs(ds.uv.x[0] - cams.WIDTH / 2) < cams.WIDTH / 2
-        assert (ds.pdf[0] > 0, weight.x[0] > 0) == (seen, seen)
+        assert (ds.pdf[0] > 0, weight.x[0] > 0) == (is_visible, is_visible)
 
 
 # Derivatives and kernels
@@ -122,7 +122,7 @@ def test_rays_derivative(camera: Camera, name: str) -> None:
     params.update()
     direction = cams.rays(loaded, np.stack([u, v], 1))[0].d
     dr.forward(shift, dr.ADFlag.ClearEdges)
-    found = (dr.grad(direction).numpy().T * towards).sum()
+    derivative = (dr.grad(direction).numpy().T * towards).sum()
 
     def projected(step: float) -> float:
         lens, c, s = camera, np.cos(np.radians(step)), np.sin(np.radians(step))
@@ -137,7 +137,7 @@ def test_rays_derivative(camera: Camera, name: str) -> None:
 
     step = 1e-5
     expected = (projected(step) - projected(-step)) / (2 * step)
-    assert found == pytest.approx(expected, rel=1e-3)
+    assert derivative == pytest.approx(expected, rel=1e-3)
 
 
 def test_nothing_is_compiled_for_another_pose_or_lens() -> None:
@@ -172,7 +172,7 @@ BORDER = {"type": "hdrfilm", "width": 48, "height": 32, "sample_border": True}
 
 
 @pytest.mark.parametrize(
-    ("more", "message"),
+    ("properties", "message"),
     [
         ({"fx": -3.0}, "camera.fx: -3.0; must be positive"),
         ({"cx": float("nan")}, "camera.cx: nan; must be finite"),
@@ -187,8 +187,8 @@ BORDER = {"type": "hdrfilm", "width": 48, "height": 32, "sample_border": True}
         ({"fx": None}, 'property named "fx"'),
     ],
 )
-def test_wrong_properties(more: dict[str, Any], message: str) -> None:
-    wrong = {"type": "opencv_camera", "fx": 30.0, "film": cams.film(), **more}
+def test_wrong_properties(properties: dict[str, Any], message: str) -> None:
+    wrong = {"type": "opencv_camera", "fx": 30.0, "film": cams.film(), **properties}
     if wrong["fx"] is None:
         del wrong["fx"]
     if "to_world" in wrong:
@@ -226,10 +226,10 @@ IN_COLOUR = pytest.mark.parametrize("each_variant", [*RGB, *SPECTRAL], indirect=
 
 
 @IN_COLOUR
-@pytest.mark.parametrize("more", [{}, cams.CROP], ids=["full", "crop"])
-def test_rays_of_the_stock_sensor(each_variant: str, more: Any) -> None:
+@pytest.mark.parametrize("crop", [{}, cams.CROP], ids=["full", "crop"])
+def test_rays_of_the_stock_sensor(each_variant: str, crop: Any) -> None:
     ours, theirs = (
-        cams.load(cams.sensor(d, **more)) for d in (cams.PINHOLE, cams.STOCK)
+        cams.load(cams.sensor(d, **crop)) for d in (cams.PINHOLE, cams.STOCK)
     )
     (a, weight_a), (b, weight_b) = (
         cams.rays(s, cams.grid_of_pixels()) for s in (ours, theirs)
@@ -241,36 +241,36 @@ def test_rays_of_the_stock_sensor(each_variant: str, more: Any) -> None:
 
 
 @IN_COLOUR
-@pytest.mark.parametrize("more", [{}, cams.CROP], ids=["full", "crop"])
-def test_directions_of_the_stock_sensor(each_variant: str, more: Any) -> None:
+@pytest.mark.parametrize("crop", [{}, cams.CROP], ids=["full", "crop"])
+def test_directions_of_the_stock_sensor(each_variant: str, crop: Any) -> None:
     # Centred: the stock sensor leaves out a strip where the principal point is not.
     centred = {"cx": 0.5 * cams.WIDTH, "cy": 0.5 * cams.HEIGHT}
     shifted = ("principal_point_offset_x", "principal_point_offset_y")
     stock = {key: value for key, value in cams.STOCK.items() if key not in shifted}
-    ours = cams.load(cams.sensor({**cams.PINHOLE, **centred}, **more))
-    theirs = cams.load(cams.sensor(stock, **more))
+    ours = cams.load(cams.sensor({**cams.PINHOLE, **centred}, **crop))
+    theirs = cams.load(cams.sensor(stock, **crop))
     spread = np.random.default_rng(0).normal(size=(3, 500)) * 1.5
     it = dr.zeros(mi.Interaction3f, 500)
     it.p = mi.Point3f(spread.astype(np.float32))
     (a, a_weight), (b, b_weight) = (
         s.sample_direction(it, mi.Point2f(0)) for s in (ours, theirs)
     )
-    seen = np.array(b.pdf) > 0
-    np.testing.assert_array_equal(np.array(a.pdf) > 0, seen)
-    assert 0.05 < seen.mean() < 0.95
+    visible = np.array(b.pdf) > 0
+    np.testing.assert_array_equal(np.array(a.pdf) > 0, visible)
+    assert 0.05 < visible.mean() < 0.95
     for name in ("uv", "d", "dist"):
-        x, y = (np.array(getattr(ds, name))[..., seen] for ds in (a, b))
+        x, y = (np.array(getattr(ds, name))[..., visible] for ds in (a, b))
         np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-5, err_msg=name)
-    x, y = (np.array(mi.Spectrum(w)[0])[seen] for w in (a_weight, b_weight))
+    x, y = (np.array(mi.Spectrum(w)[0])[visible] for w in (a_weight, b_weight))
     np.testing.assert_allclose(x, y, rtol=1e-5)
 
 
 @IN_COLOUR
 @pytest.mark.parametrize("kind", ["aov", "prb"])
 def test_image_of_the_stock_sensor(each_variant: str, kind: str) -> None:
-    more = {"rfilter": {"type": "gaussian"}, "sample_border": True, **cams.CROP}
+    film = {"rfilter": {"type": "gaussian"}, "sample_border": True, **cams.CROP}
     scenes = (
-        cams.world(cams.sensor(d, **more), cams.INTEGRATORS[kind])
+        cams.world(cams.sensor(d, **film), cams.INTEGRATORS[kind])
         for d in (cams.PINHOLE, cams.STOCK)
     )
     ours, theirs = (np.array(mi.render(scene, spp=4, seed=3)) for scene in scenes)

@@ -89,7 +89,7 @@ SHEARED[0, 1] = 0.5
 
 
 @pytest.mark.parametrize(
-    ("more", "message"),
+    ("properties", "message"),
     [
         ({"foo": 1.0}, '(?s)unreferenced pro.*"foo"'),
         *[({"to_world": m}, "to_world: .*uniform scale") for m in (*UNEVEN, SHEARED)],
@@ -104,10 +104,10 @@ SHEARED[0, 1] = 0.5
         ({"filename": None}, "filename"),
     ],
 )
-def test_volumes_refuse(volumes, more: dict[str, Any], message: str) -> None:
-    wrong = {**volumes["grid_field"], **more}
-    if "to_world" in more:
-        wrong["to_world"] = mi.ScalarTransform4f(more["to_world"])
+def test_volumes_refuse(volumes, properties: dict[str, Any], message: str) -> None:
+    wrong = {**volumes["grid_field"], **properties}
+    if "to_world" in properties:
+        wrong["to_world"] = mi.ScalarTransform4f(properties["to_world"])
     present = {key: value for key, value in wrong.items() if value is not None}
     with pytest.raises(Exception, match=message):
         mi.load_dict(present)
@@ -145,17 +145,17 @@ def test_values_and_bounds_in_the_world(volumes, rng, kind: str) -> None:
     it.p = 2 * mi.Point3f(np.stack([-y, x, z])) + mi.Vector3f(5, 0, 0)
     evaluate = small.eval_grid if kind == "grid_field" else small.evaluate
     density, radiance = evaluate(load_field(volumes[kind]["filename"]), place)
-    found = loaded.eval_1(it).numpy()
+    evaluated = loaded.eval_1(it).numpy()
     outside = (np.abs(place) > 1).any(1)
     density = np.where(outside, 0, density / 2)
-    np.testing.assert_allclose(found, density, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(evaluated, density, rtol=1e-4, atol=1e-7)
     spectrum = loaded.eval(it).numpy()
-    np.testing.assert_allclose(spectrum, np.tile(found, (3, 1)), rtol=1e-5)
+    np.testing.assert_allclose(spectrum, np.tile(evaluated, (3, 1)), rtol=1e-5)
     colour = loaded.eval_3(it).numpy().T
     assert not colour[outside].any()
     if kind == "grid_field":
         np.testing.assert_allclose(colour[~outside], radiance[~outside], atol=1e-5)
-    assert 0 < found.max() <= loaded.max() < 10 * found.max()
+    assert 0 < evaluated.max() <= loaded.max() < 10 * evaluated.max()
     assert loaded.max_per_channel() == [loaded.max()] * 3
     askew = T().translate([5, 0, 0]).scale(2).rotate([0, 0, 1], 45)
     box, reach = mi.load_dict({**volumes[kind], "to_world": askew}).bbox(), np.sqrt(8)
@@ -226,8 +226,8 @@ def test_thin_parts_that_are_skipped_have_no_derivative_by_a_pose(tmp_path) -> N
     path = tmp_path / "ngp.safetensors"
     save_field(path, ngp)
     described = {"type": "ngp_field", "filename": str(path)}
-    whole, thin = shown(described), shown({**described, "skip_thin": True})
-    assert np.abs(whole - thin).max() > 0.01
+    full, thin = shown(described), shown({**described, "skip_thin": True})
+    assert np.abs(full - thin).max() > 0.01
     # files have half precision
     np.testing.assert_allclose(thin, shown(volume_of(ngp)), atol=1e-3)
     params = mi.traverse(small.load({"scene": volume_of(ngp)}))

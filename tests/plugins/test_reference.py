@@ -62,10 +62,12 @@ def read_rows(text: str) -> list[Row]:
     count = re.search(r":extra-rows: (\d+)", table[1])
     rows = []
     for k, part in enumerate(re.split(r"^     \* - ", table[1], flags=re.M)[1:]):
-        names, _, *more = re.split(r"^       - ", part, flags=re.M)
-        assert more, f"{names}: no description"
+        names, _, *columns = re.split(r"^       - ", part, flags=re.M)
+        assert columns, f"{names}: no description"
         flags = (
-            frozenset(re.findall(r"\|(\w+)\|", more[1])) if more[1:] else frozenset()
+            frozenset(re.findall(r"\|(\w+)\|", columns[1]))
+            if columns[1:]
+            else frozenset()
         )
         is_parameter = count is None or k < int(count[1])
         rows.append(Row(tuple(names.strip().split(", ")), is_parameter, flags))
@@ -111,8 +113,8 @@ def minimal(name: str) -> dict[str, Any]:
     return {"type": name} | required
 
 
-def load(name: str, **more: Any) -> Any:
-    return mi.load_dict(minimal(name) | more, parallel=False)
+def load(name: str, **properties: Any) -> Any:
+    return mi.load_dict(minimal(name) | properties, parallel=False)
 
 
 def queried_in_python(name: str) -> set[str]:
@@ -120,9 +122,9 @@ def queried_in_python(name: str) -> set[str]:
     asked: set[str] = set()
 
     def noting(method: str) -> Any:
-        def note(self: mi.Properties, key: str, *more: Any) -> Any:
+        def note(self: mi.Properties, key: str, *default: Any) -> Any:
             asked.add(key)
-            return getattr(mi.Properties, method)(self, key, *more)
+            return getattr(mi.Properties, method)(self, key, *default)
 
         return note
 
@@ -130,10 +132,10 @@ def queried_in_python(name: str) -> set[str]:
     Recorder = type("Recorder", (mi.Properties,), {m: noting(m) for m in methods})
     cls = type(load(name))
     props = Recorder(name)
-    more = {}
+    nested = {}
     if name == "opencv_camera":
-        more = {"film": {"type": "hdrfilm"}, "sampler": {"type": "independent"}}
-    for key, value in (minimal(name) | more).items():
+        nested = {"film": {"type": "hdrfilm"}, "sampler": {"type": "independent"}}
+    for key, value in (minimal(name) | nested).items():
         if key != "type":
             is_nested = isinstance(value, dict)
             props[key] = mi.load_dict(value, parallel=False) if is_nested else value
@@ -180,7 +182,7 @@ def test_rows_are_what_traverse_shows(name):
 
 def _flags(params: mi.SceneParameters) -> dict[str, set[str]]:
     """Translate flags to the words of the reference."""
-    found = {}
+    words_by_key = {}
     for key in params.properties:
         flags = int(params.flags(key))
         words = {"exposed"}
@@ -188,8 +190,8 @@ def _flags(params: mi.SceneParameters) -> dict[str, set[str]]:
             words.add("differentiable")
         if flags & int(mi.ParamFlags.Discontinuous):
             words.add("discontinuous")
-        found[key] = words
-    return found
+        words_by_key[key] = words
+    return words_by_key
 
 
 @pytest.mark.parametrize("name", NAMES)

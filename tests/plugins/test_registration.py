@@ -129,11 +129,11 @@ PLUGINS = {
 }
 
 
-def run(folder: Path, code: str, **more: str) -> tuple[list[str], str]:
+def run(folder: Path, code: str, **variables: str) -> tuple[list[str], str]:
     """Run a script that can use a field; return what it printed, and its errors."""
     path = folder / "field.safetensors"
     save_field(path, GridField(GridLayout(1, 2, 2), [-1, -1, -1], [1, 1, 1]))
-    environment = {**os.environ, llvm.VARIABLE: str(llvm.locate().path), **more}
+    environment = {**os.environ, llvm.VARIABLE: str(llvm.locate().path), **variables}
     done = subprocess.run(
         [sys.executable, "-c", USE + code, str(path)],
         env=environment,
@@ -155,14 +155,14 @@ def test_plugins_are_there_in_any_order(tmp_path: Path, order: str) -> None:
     assert not error and printed == PRINTED.get(order, [RGB])
 
 
-def discover(folder: Path, code: str, **more: str) -> tuple[list[str], str]:
+def discover(folder: Path, code: str, **variables: str) -> tuple[list[str], str]:
     """Run a script in which only Mitsuba imports our package, if nothing else does."""
     info = folder / "other-1.0.dist-info"
     info.mkdir(exist_ok=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(ENTRY_POINTS)
     places = map(str, (ROOT, ROOT / "tests", folder))
-    return run(folder, code, PYTHONPATH=os.pathsep.join(places), **more)
+    return run(folder, code, PYTHONPATH=os.pathsep.join(places), **variables)
 
 
 @pytest.mark.usefixtures("variant")

@@ -107,15 +107,15 @@ def problem(loaded: mi.Scene, name: str, spp: int = 2) -> Derivatives:
     return Derivatives(params, key_of(params, name), images(loaded, params, spp))
 
 
-def check(found: Derivatives, rng: np.random.Generator) -> None:
+def check(derivatives: Derivatives, rng: np.random.Generator) -> None:
     """Compare derivatives along a random direction.
 
     On CUDA networks compute in half precision, so their comparison is loose there.
     """
     options = ()
-    if found.key.rpartition(".")[2] in NETWORKS:
+    if derivatives.key.rpartition(".")[2] in NETWORKS:
         options = (2e-2, 0.1) if mi.variant().startswith("cuda") else (2e-2,)
-    found.check([rng.normal(0, 1, found.base.shape)], *options)
+    derivatives.check([rng.normal(0, 1, derivatives.base.shape)], *options)
 
 
 # Volumes
@@ -154,7 +154,7 @@ def test_spectra_of_volumes_are_those_of_their_colours(volumes, rng) -> None:
     loaded = mi.load_dict({**volumes["grid"], "quantity": "radiance"})
     it = interactions(rng)
     colour = loaded.eval_3(it)
-    found = np.array(loaded.eval(it))
+    spectrum = np.array(loaded.eval(it))
     if mi.is_monochromatic:
         expected = np.array(mi.luminance(mi.Color3f(colour)))[None]
     elif mi.is_spectral:
@@ -163,7 +163,7 @@ def test_spectra_of_volumes_are_those_of_their_colours(volumes, rng) -> None:
         expected = lit / d65
     else:
         expected = np.array(colour)
-    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    np.testing.assert_allclose(spectrum, expected, rtol=1e-4)
     if mi.is_rgb:
         luminance = np.array(mi.luminance(mi.Color3f(colour)))
         np.testing.assert_allclose(loaded.eval_1(it).numpy(), luminance, atol=1e-4)
@@ -201,13 +201,13 @@ def test_path_shows_what_the_integrator_shows(tmp_path, rng, eye) -> None:
     loaded = load(fields, eye=eye)
     expected = images(loaded, {}, 1)().numpy()
     cube = emitter(fields, one="grid", two="ngp")["cube"]
-    found = images(load({"type": "path"}, {"cube": cube}, eye=eye), {}, 1)().numpy()
+    image = images(load({"type": "path"}, {"cube": cube}, eye=eye), {}, 1)().numpy()
     assert expected.std() > 0.01
     # Rays that pass by the cube see the sky of the integrator alone.
-    met = found.sum(-1) > 0
+    met = image.sum(-1) > 0
     # Outside, the steps count from the cube instead of the camera.
     atol = 1e-4 if eye[0] < 1 else 3e-3
-    np.testing.assert_allclose(found[met], expected[met], rtol=1e-3, atol=atol)
+    np.testing.assert_allclose(image[met], expected[met], rtol=1e-3, atol=atol)
 
 
 @IN_RGB_FIRST
@@ -218,13 +218,15 @@ def test_path_shows_what_the_integrator_shows(tmp_path, rng, eye) -> None:
 )
 def test_field_emitter(volumes, rng, seeing: str, eye) -> None:
     world = emitter(volumes, a="grid")
-    found = problem(load({"type": seeing}, world, eye=eye, target=BELOW), "colour", 4)
-    rough = rng.normal(0, 1, found.base.shape)
-    gradient = found.gradient() @ rough.ravel()
-    assert gradient == pytest.approx(found.difference(rough, 0.05), rel=1e-3)
+    derivatives = problem(
+        load({"type": seeing}, world, eye=eye, target=BELOW), "colour", 4
+    )
+    rough = rng.normal(0, 1, derivatives.base.shape)
+    gradient = derivatives.gradient() @ rough.ravel()
+    assert gradient == pytest.approx(derivatives.difference(rough, 0.05), rel=1e-3)
     if seeing == "prb" and mi.is_spectral:
         return  # Mitsuba 3.9's prb has no forward mode in spectral variants
-    assert found.tangent(rough) == pytest.approx(gradient, rel=1e-3)
+    assert derivatives.tangent(rough) == pytest.approx(gradient, rel=1e-3)
 
 
 DIRECT = {"type": "direct", "bsdf_samples": 1, "emitter_samples": 0}  # compiles fast
@@ -248,10 +250,10 @@ def test_field_emitter_of_two_fields_by_depth(volumes, rng) -> None:
 def test_opacity_one(volumes, rng) -> None:
     loaded = load(integrator(volumes, a="opaque", aovs=True), eye=SIDE)
     assert np.array(mi.render(loaded, spp=1))[..., -2].max() > 1 - 1e-6
-    found, by_density = problem(loaded, "colour"), problem(loaded, "density")
-    check(found, rng)
+    by_colour, by_density = problem(loaded, "colour"), problem(loaded, "density")
+    check(by_colour, rng)
     # Nothing passes: more density changes no colour, as all have the same.
-    most = np.abs(found.gradient()).max()
+    most = np.abs(by_colour.gradient()).max()
     assert np.abs(by_density.gradient()).max() < 1e-3 * most
     lamp = load(DIRECT, emitter(volumes, a="opaque"), eye=(3, 2, 1))
     check(problem(lamp, "colour"), rng)
@@ -274,6 +276,6 @@ def test_nothing_in_view(volumes, rng, name: str, is_lamp: bool, eye, target) ->
         seeing, world = DIRECT, emitter(volumes, a=name)
     loaded = load(seeing, world, eye=eye, target=target)
     for key in ("colour", "density"):
-        found = problem(loaded, key)
-        assert not found.output().numpy().any()
-        found.check_zero(rng.normal(0, 1, found.base.shape))
+        derivatives = problem(loaded, key)
+        assert not derivatives.output().numpy().any()
+        derivatives.check_zero(rng.normal(0, 1, derivatives.base.shape))

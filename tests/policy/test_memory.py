@@ -111,8 +111,8 @@ def test_reverse_mode_of_a_step_equals_differences(make, dtype, rng):
 
     def value(s):
         moved = tuple(m + s * t for m, t in zip(memory, t_memory, strict=True))
-        control, parts = twin.step(exact(image + s * t_image), 1, moved)
-        pairs = zip(parts, d_after, strict=True)
+        control, memory_after = twin.step(exact(image + s * t_image), 1, moved)
+        pairs = zip(memory_after, d_after, strict=True)
         return control.numpy() @ weight + sum(float((p * d).sum()) for p, d in pairs)
 
     d_image, d_memory, _ = policies[dtype].step_vjp(
@@ -129,15 +129,15 @@ def test_reverse_mode_of_a_step_equals_differences(make, dtype, rng):
 
 def test_frame_stack_repeats_the_first_image_and_keeps_the_stride():
     preprocess = pre.Preprocess(frames=3, stride=2)
-    past, seen = torch.zeros(1, 0, 0, 0, 0), []
+    past, stacks = torch.zeros(1, 0, 0, 0, 0), []
     for frame in torch.arange(7.0):
         stacked, past = preprocess.stack(frame.expand(1, 1, 1, 1), past)
         assert past.shape[1] <= preprocess.history == 4
-        seen.append([int(value) for value in stacked.flatten()])
+        stacks.append([int(value) for value in stacked.flatten()])
     # no frame that has dropped out is kept
     assert past.untyped_storage().nbytes() == past.numel() * 4 == 4 * 4
     first = [[0, 0, 0], [0, 0, 1], [0, 0, 2], [0, 1, 3]]
-    assert seen == [*first, [0, 2, 4], [1, 3, 5], [2, 4, 6]]
+    assert stacks == [*first, [0, 2, 4], [1, 3, 5], [2, 4, 6]]
 
 
 def test_planes_are_the_stack_after_its_transforms(rng):
@@ -149,10 +149,10 @@ def test_planes_are_the_stack_after_its_transforms(rng):
     memory = policy.initial_memory(2)
     for image in map(mi.TensorXf, images[:3]):
         _, memory = policy.step(image, 0, memory)
-    found = policy.planes(mi.TensorXf(images[3]), memory)
+    planes = policy.planes(mi.TensorXf(images[3]), memory)
     weights = np.array([0.299, 0.587, 0.114])
     expected = np.stack([image[:, 2:, 1:-1] @ weights for image in images[1:]], 1)
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    np.testing.assert_allclose(planes, expected, atol=1e-6)
 
 
 def of_shape(*shape):

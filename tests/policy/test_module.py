@@ -142,10 +142,10 @@ class Stateful(nn.Module):
     [("level", "its controls"), ("random", "its controls"), ("count", "'count'")],
 )
 def test_modules_that_are_not_repeatable_are_refused(kind, message, rng):
-    for mode, more in (("step", ()), ("step_vjp", (mi.Float(1, 1), ()))):
+    for mode, cotangents in (("step", ()), ("step_vjp", (mi.Float(1, 1), ()))):
         made, image = TorchPolicy(Stateful(kind), NoGoal(), name="a.py"), images(rng)
         with pytest.raises(InputError, match=f"a.py: .*{message}"):
-            getattr(made, mode)(image, 0, (), *more)
+            getattr(made, mode)(image, 0, (), *cotangents)
 
 
 def test_the_check_is_made_once_and_minds_no_rounding(rng):
@@ -203,7 +203,7 @@ def test_a_module_says_how_it_takes_the_goal(line, goal, tmp_path):
     code = f"import torch\n\n\nclass Net(torch.nn.Module):\n    {line}\n"
     (tmp_path / "net.py").write_text(code)
     file = {"file": "net.py:Net", "trust_code": True}
-    made = [load_policy({**file, **more}, tmp_path) for more in ({}, {"batch": 1})]
+    made = [load_policy({**file, **extra}, tmp_path) for extra in ({}, {"batch": 1})]
     for policy in (*made, TorchPolicy(made[0].module)):
         assert policy.goal == goal
     chosen = load_policy({**file, "goal": {"kind": "none"}}, tmp_path)
@@ -226,9 +226,9 @@ def test_several_controls_are_rows_and_go_back(rng):
     assert type(rows) is mi.ArrayXf and rows.shape == (2, 2)
     np.testing.assert_allclose(rows.numpy().T, expected.numpy(), rtol=1e-5)
     cotangent = mi.ArrayXf([1.0, 0.0], [0.0, 3.0])
-    found = made.step_vjp(image, 0, (), cotangent, ())[0].numpy()
+    gradient = made.step_vjp(image, 0, (), cotangent, ())[0].numpy()
     by_mean = np.stack([2 * weight[:, 2].numpy(), -1.5 * weight[:, 0].numpy()])
-    expected = np.broadcast_to(by_mean[:, None, None] / np.prod(SIZE), found.shape)
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    expected = np.broadcast_to(by_mean[:, None, None] / np.prod(SIZE), gradient.shape)
+    np.testing.assert_allclose(gradient, expected, rtol=1e-5)
     with pytest.raises(InputError, match=r"output \(is \(3, 0\)\)"):
         policy(lambda x: x.mean((2, 3)), action=Action((3, 0))).control(image, 0)

@@ -16,7 +16,7 @@ from mi_nerfattack.policy.torch_policy import TorchPolicy
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-TOLD = Numbers(speed=True, route_m=(5.0, 10.0), time=True)
+NUMBERS = Numbers(speed=True, route_m=(5.0, 10.0), time=True)
 VIEWS = {
     "front": (slice(0, 4), slice(0, 6)),
     "left": (slice(0, 3), slice(6, 10)),
@@ -31,46 +31,49 @@ class Wide(nn.Module):
         torch.manual_seed(3)
         self.front = nn.Linear(72, 2)
         self.left = nn.Linear(36, 2)
-        self.rest = nn.Linear(5, 2)
+        self.numbers = nn.Linear(5, 2)
 
     def forward(self, left, speed, front, route, goal):
         assert left.shape[1:] == (3, 3, 4) and front.shape[1:] == (3, 4, 6)
-        told = torch.cat([speed, route.flatten(1)], 1)
+        numbers = torch.cat([speed, route.flatten(1)], 1)
         images = self.front(front.flatten(1)) + self.left(left.flatten(1))
-        return torch.tanh(images + self.rest(told) + 0.1 * goal[:, None])
+        return torch.tanh(images + self.numbers(numbers) + 0.1 * goal[:, None])
 
 
 def wide():
-    inputs = Inputs(("left", "speed", "front", "route", "goal"), TOLD, VIEWS)
+    inputs = Inputs(("left", "speed", "front", "route", "goal"), NUMBERS, VIEWS)
     action = Action((1, 0), (2.0, -1.0))
     return TorchPolicy(Wide().double(), IntegerGoal(3), action=action, inputs=inputs)
 
 
 def test_order_and_derivatives_of_all_that_is_given(rng):
-    frame, numbers = rng.uniform(0, 1, (2, 4, 10, 3)), rng.normal(size=(2, TOLD.size))
+    frame, numbers = (
+        rng.uniform(0, 1, (2, 4, 10, 3)),
+        rng.normal(size=(2, NUMBERS.size)),
+    )
     frame = mi.TensorXf(frame.astype(np.float32))
     numbers = mi.TensorXf(numbers.astype(np.float32))
     policy = wide()
     control, memory = policy.step(frame, 2, (), numbers)
     assert memory == () and np.array(control).shape == (2, 2)  # k rows of n
-    told = torch.from_numpy(numbers.numpy()).double().requires_grad_()
+    numbers64 = torch.from_numpy(numbers.numpy()).double().requires_grad_()
     image = torch.from_numpy(frame.numpy()).double().requires_grad_()
-    found = policy.module(
+    outputs = policy.module(
         image[:, :3, 6:].permute(0, 3, 1, 2),
-        told[:, :1],
+        numbers64[:, :1],
         image[:, :4, :6].permute(0, 3, 1, 2),
-        told[:, 1:5].reshape(2, 2, 2),
+        numbers64[:, 1:5].reshape(2, 2, 2),
         torch.tensor([2, 2]),
     )
-    wanted = torch.stack([2 * found[:, 1], -found[:, 0]], 1)
-    np.testing.assert_allclose(np.array(control).T, wanted.detach(), rtol=1e-6)
+    expected = torch.stack([2 * outputs[:, 1], -outputs[:, 0]], 1)
+    np.testing.assert_allclose(np.array(control).T, expected.detach(), rtol=1e-6)
 
     weight = rng.normal(size=(2, 2))  # k rows
     rows = type(control)(*map(mi.Float, weight.astype(np.float32).tolist()))
     d_image, _, d_numbers = policy.step_vjp(frame, 2, (), rows, (), numbers)
-    (wanted * torch.from_numpy(weight.T)).sum().backward()
+    (expected * torch.from_numpy(weight.T)).sum().backward()
     np.testing.assert_allclose(d_image.numpy(), image.grad, atol=1e-6)
-    np.testing.assert_allclose(d_numbers.numpy(), told.grad, atol=1e-6)
+    np.testing.assert_allclose(d_numbers.numpy(), numbers64.grad, atol=1e-6)
     assert not d_numbers.numpy()[:, -1].any()  # the network does not take the time
 
 
@@ -89,33 +92,33 @@ def test_stacks_of_frames_are_kept_camera_by_camera(rng):
     memory = policy.initial_memory(1)
     for frame in frames:
         control, memory = policy.step(mi.TensorXf(frame), 0, memory)
-    wanted = frames[0][0, :4, :6].mean() + 10 * frames[1][0, :3, 6:].mean()
-    assert float(control[0]) == pytest.approx(wanted, rel=1e-5)
+    expected = frames[0][0, :4, :6].mean() + 10 * frames[1][0, :3, 6:].mean()
+    assert float(control[0]) == pytest.approx(expected, rel=1e-5)
 
 
 def test_a_frame_of_other_cameras_is_refused(rng):
     frame = mi.TensorXf(rng.uniform(0, 1, (1, 4, 9, 3)).astype(np.float32))
-    numbers = mi.TensorXf(np.ones((1, TOLD.size), np.float32))
+    numbers = mi.TensorXf(np.ones((1, NUMBERS.size), np.float32))
     with pytest.raises(InputError, match="9 x 4 px; .* have 10 x 4 px"):
         wide().step(frame, 0, (), numbers)
 
 
 def test_functions_get_what_they_name(rng):
-    seen = {}
+    arguments = {}
 
     def drive(route, front, step):
-        seen.update(route=route, front=front, step=step)
+        arguments.update(route=route, front=front, step=step)
         return route[:, 0, 1]
 
-    inputs = Inputs(("route", "front"), TOLD, VIEWS)
+    inputs = Inputs(("route", "front"), NUMBERS, VIEWS)
     policy = CallablePolicy(drive, "mine.py:drive", inputs=inputs)
-    numbers = rng.normal(size=(1, TOLD.size)).astype(np.float32)
+    numbers = rng.normal(size=(1, NUMBERS.size)).astype(np.float32)
     frame = mi.TensorXf(rng.uniform(0, 1, (1, 4, 10, 3)).astype(np.float32))
     memory = policy.initial_memory(1)
     for step in range(2):
         control, memory = policy.step(frame, 0, memory, mi.TensorXf(numbers))
-        assert seen["step"] == step and seen["front"].shape == (1, 3, 4, 6)
-    np.testing.assert_array_equal(seen["route"].ravel(), numbers[0, 1:5])
+        assert arguments["step"] == step and arguments["front"].shape == (1, 3, 4, 6)
+    np.testing.assert_array_equal(arguments["route"].ravel(), numbers[0, 1:5])
     assert float(control[0]) == numbers[0, 2]
     with pytest.raises(InputError, match="it asks for speed, route, time, 6 numbers"):
         policy.step(frame, 0, memory)
@@ -126,12 +129,12 @@ def test_functions_get_what_they_name(rng):
 )
 def test_unknown_inputs_are_refused(names):
     with pytest.raises(InputError, match="each of front, left, .* once|no image"):
-        Inputs(names, TOLD, VIEWS)
+        Inputs(names, NUMBERS, VIEWS)
 
 
 def test_what_contradicts_itself_is_refused():
     with pytest.raises(InputError, match="cameras: speed is another input"):
-        Inputs((), TOLD, {"speed": VIEWS["front"]})
+        Inputs((), NUMBERS, {"speed": VIEWS["front"]})
     with pytest.raises(InputError, match="let both have a goal, or none"):
         TorchPolicy(nn.Flatten(), IntegerGoal(3), inputs=Inputs(("image",)))
     with pytest.raises(InputError, match="a column stands twice"):
@@ -188,10 +191,10 @@ def test_a_circle_is_followed_with_its_own_curvature(curvature):
 
 def test_axes_and_flat_positions():
     points, speed = arc(0.08, 5.0, CAR.times_s), torch.tensor([5.0]).double()
-    wanted = CAR.follow(points, speed)
+    expected = CAR.follow(points, speed)
     mirrored = torch.stack([-points[..., 1], points[..., 0]], 2)
     right = Trajectory(**{**vars(CAR), "axes": "right_forward"})
-    np.testing.assert_allclose(right.follow(mirrored.flatten(1), speed), wanted)
+    np.testing.assert_allclose(right.follow(mirrored.flatten(1), speed), expected)
     with pytest.raises(InputError, match="4 points of two numbers"):
         CAR.follow(points[:, :3], speed)
 
@@ -204,9 +207,9 @@ def test_derivatives_of_following(rng):
     leaves = points.requires_grad_(), speed.requires_grad_()
     assert torch.autograd.gradcheck(CAR.follow, leaves)
     standing = torch.zeros(1, 4, 2, dtype=torch.float64, requires_grad=True)
-    found = CAR.follow(standing, torch.zeros(1).double())
-    found.sum().backward()
-    assert found.isfinite().all() and standing.grad.isfinite().all()
+    control = CAR.follow(standing, torch.zeros(1).double())
+    control.sum().backward()
+    assert control.isfinite().all() and standing.grad.isfinite().all()
 
 
 def test_a_path_is_followed_at_the_vehicles_speed():

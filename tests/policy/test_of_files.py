@@ -151,8 +151,8 @@ def test_black_boxes_refuse_gradients_by_name(tmp_path, rng):
         "def drive(image, goal, step):\n"
         "    image *= 0; goal += 0; result = goal + step; goal += 1; return result\n"
     )
-    found = {"kind": "callable", "file": "mine.py:drive", "trust_code": True}
-    policy = policy_of(tmp_path, **found, control_scale=0.5)
+    keys = {"kind": "callable", "file": "mine.py:drive", "trust_code": True}
+    policy = policy_of(tmp_path, **keys, control_scale=0.5)
     image, memory = camera(2, rng), policy.initial_memory(2)
     before = image.numpy().copy()
     for step in range(3):  # it may write into what it is given
@@ -160,7 +160,7 @@ def test_black_boxes_refuse_gradients_by_name(tmp_path, rng):
         np.testing.assert_allclose(control, [0.5 * step, 0.5 * (3 + step)])
         np.testing.assert_array_equal(image.numpy(), before)
     assert not policy.differentiable
-    section = read_section("policy", PolicySection, found, tmp_path)
+    section = read_section("policy", PolicySection, keys, tmp_path)
     for call in (
         lambda: policy.vjp(image, 0, mi.Float(1)),
         lambda: policy.step_vjp(image, 0, memory, mi.Float(1), ()),
@@ -188,8 +188,8 @@ def test_black_boxes_see_the_frame_stack(tmp_path):
         assert planes.shape == (1, 2, 4, 5)
         assert planes[0, :, 1, 2] == pytest.approx([before, level], abs=1e-6)
         before = level
-        seen, memory = policy.step(image, 0, memory)
-        assert seen.numpy() == pytest.approx(control, abs=1e-6)
+        actual, memory = policy.step(image, 0, memory)
+        assert actual.numpy() == pytest.approx(control, abs=1e-6)
         assert memory[1].numel() == 4 * 5
 
 

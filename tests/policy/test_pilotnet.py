@@ -47,11 +47,11 @@ def test_save_and_load(tmp_path):
 
 
 def test_images_are_not_copied_and_derivatives_are_evaluated(rng):
-    seen = []
+    addresses = []
 
     class Spy(PilotNet):
         def forward(self, image, goal):
-            seen.append(image.data_ptr())
+            addresses.append(image.data_ptr())
             return super().forward(image, goal)
 
     policy, image = TorchPolicy(Spy()), mi.TensorXf(images(3, rng))
@@ -70,7 +70,7 @@ def test_images_are_not_copied_and_derivatives_are_evaluated(rng):
     assert np.linalg.norm(gradient.numpy() - exact) < 1e-5 * np.linalg.norm(exact)
     one = mi.TensorXf(image.numpy()[:1])
     np.testing.assert_allclose(policy.control(one, [0]), control[0], atol=1e-6)
-    assert seen[-1] == dr.detach(one).torch().data_ptr()
+    assert addresses[-1] == dr.detach(one).torch().data_ptr()
 
 
 def coloured(n, rng):
@@ -86,15 +86,15 @@ SETTINGS = TrainSettings(epochs=4, batch=16, held_out=0.2, seed=3)
 
 def test_dataset_reads_across_shards(tmp_path, rng):
     """Without an open file per shard: 192,000 frames in shards of 64 are too many."""
-    parts = [coloured(n, rng) for n in (5, 1, 7, *[1] * 20)]
-    shards = [write_shard(tmp_path / str(i), *part) for i, part in enumerate(parts)]
+    batches = [coloured(n, rng) for n in (5, 1, 7, *[1] * 20)]
+    shards = [write_shard(tmp_path / str(i), *batch) for i, batch in enumerate(batches)]
     opened = Path("/proc/self/fd")
     before = len(os.listdir(opened)) if opened.exists() else 0
     data = FrameDataset.from_shards(shards)
     assert not opened.exists() or len(os.listdir(opened)) <= before
     rows = np.array([12, 0, 5, 4, 6, 32])
-    whole, controls = (np.concatenate([part[i] for part in parts]) for i in (0, 2))
-    np.testing.assert_array_equal(data.read_frames(rows), whole[rows])
+    frames, controls = (np.concatenate([batch[i] for batch in batches]) for i in (0, 2))
+    np.testing.assert_array_equal(data.read_frames(rows), frames[rows])
     np.testing.assert_array_equal(data.controls, controls)
 
 
@@ -114,8 +114,8 @@ def test_shards_are_held_out_by_themselves(tmp_path, rng):
     train, held = divide_shards(shards, 0.25)
     # 60 draws: 15 are expected, with a standard deviation of 3.4
     assert 5 <= len(held) <= 25 and sorted(train + held) == sorted(shards)
-    parts = [divide_shards([shard], 0.25) for shard in shards]
-    assert [item for _, part in parts for item in part] == held
+    divisions = [divide_shards([shard], 0.25) for shard in shards]
+    assert [item for _, part in divisions for item in part] == held
     assert divide_shards(shards, 0.0) == (shards, [])
     for fraction, sizes in ((0.0, (2, 1)), (0.999, (1, 2))):  # never on one side
         train, held = divide_shards(shards[:3], fraction, least=1)
@@ -162,12 +162,12 @@ def train(data, settings=SETTINGS, **arguments):
 
 
 def test_training_learns_and_continues_after_an_interruption(rng, tmp_path):
-    parts = [(name, coloured(n, rng)) for name, n in (("a", 70), ("b", 58))]
+    batches = [(name, coloured(n, rng)) for name, n in (("a", 70), ("b", 58))]
     data = FrameDataset.from_shards(
-        [write_shard(tmp_path / name, *part) for name, part in parts]
+        [write_shard(tmp_path / name, *batch) for name, batch in batches]
     )
-    whole, history = train(data)
-    assert len(history) == 4 and not whole.training
+    trained, history = train(data)
+    assert len(history) == 4 and not trained.training
     # Guessing zero is off by 0.5 on average.
     assert min(row["held_out_error"] for row in history) < 0.15
     path = tmp_path / "state.safetensors"
@@ -182,7 +182,7 @@ def test_training_learns_and_continues_after_an_interruption(rng, tmp_path):
     resumed, continued = train(data, checkpoint=path, progress=steps.append)
     assert (steps[0].epoch, steps[-1].epoch) == (3, 4)
     assert continued == history
-    for one, other in zip(whole.parameters(), resumed.parameters(), strict=True):
+    for one, other in zip(trained.parameters(), resumed.parameters(), strict=True):
         assert torch.equal(one, other)
     frames = 255 - data.read_frames(np.arange(len(data)))
     other = dataclasses.replace(data, frames=(frames,))

@@ -66,8 +66,8 @@ def test_bgr_linear_crops_and_normalising(rng):
     levels = np.float32([0.0, 0.04045, 0.1, 0.5, 1.0]).reshape(1, 5, 1).repeat(3, 2)
     # IEC 61966-2-1: 0.04045 / 12.92, and 0.5 has 21.4 % of the light
     expected = [0.0, 0.0031308, 0.0100228, 0.2140411, 1.0]
-    found = applied(pre.ToLinear(), levels)[0, :, 1]
-    np.testing.assert_allclose(found, expected, atol=1e-7)
+    linear = applied(pre.ToLinear(), levels)[0, :, 1]
+    np.testing.assert_allclose(linear, expected, atol=1e-7)
     cut = applied(pre.Crop(1, 2, 3, 4), image)
     np.testing.assert_array_equal(cut, image[1:10, 3:16])
     # 0.3 of 12 rows is 3.6: four; 0.125 of 20 columns is 2.5: three

@@ -52,8 +52,8 @@ def test_box_of_a_run(run):
     assert box.edges_mm(40.0) == pytest.approx([40, 40, 40])
     assert set(box.images) == set(FACES) and len(views.camera_to_world) == 3
     steps = np.linalg.norm(np.diff(views.camera_to_world[:, :3, 3], axis=0), axis=1)
-    (found,) = read_found([run])
-    np.testing.assert_allclose(steps, views.period * found.route.speed_ms, rtol=0.02)
+    (attack,) = read_found([run])
+    np.testing.assert_allclose(steps, views.period * attack.route.speed_ms, rtol=0.02)
     # colours rise with x, y and z: of the front, red to the right and blue upwards
     front = box.images["front"].astype(int)
     assert front.shape == (24, 24, 3) and front.min() > 5
@@ -182,8 +182,8 @@ def test_overlay_of_recordings(run, recorded, tmp_path, capsys, monkeypatch):
     assert overlay("drive.mp4", "out.mp4") == 0
     capsys.readouterr()
     assert overlay("drive", "out", "--json") == 0
-    told = {"output": str(tmp_path / "out"), "frames": 3, "object": "ball"}
-    assert json.loads(capsys.readouterr().out) == told
+    expected = {"output": str(tmp_path / "out"), "frames": 3, "object": "ball"}
+    assert json.loads(capsys.readouterr().out) == expected
     for path in sorted((tmp_path / "out").iterdir()):
         frame = files.read_image(path)
         assert (frame[:4] == 0).all()  # above the target
@@ -193,14 +193,14 @@ def test_overlay_of_recordings(run, recorded, tmp_path, capsys, monkeypatch):
     for name, number in (("cut", signal.SIGINT), ("cut.mp4", signal.SIGTERM)):
         with signalled("overlaying", number, at=2):
             assert overlay("drive", name) == 130
-    kept = sorted((tmp_path / "cut").iterdir())
-    assert len(kept) == 2 and not list(tmp_path.glob("cut.mp4*"))
-    assert all(files.read_image(path).shape == (32, 48, 3) for path in kept)
+    paths = sorted((tmp_path / "cut").iterdir())
+    assert len(paths) == 2 and not list(tmp_path.glob("cut.mp4*"))
+    assert all(files.read_image(path).shape == (32, 48, 3) for path in paths)
     # a folder without times has the run's period
     box, views = read_box(run, texture_px=24)
     for period, code in ((0.2, 0), (1e-4, 2)):
-        found = box, replace(views, period=period)
-        monkeypatch.setattr(attacked, "read_box", lambda *_, found=found: found)
+        pair = box, replace(views, period=period)
+        monkeypatch.setattr(attacked, "read_box", lambda *_, pair=pair: pair)
         assert overlay("drive", f"{code}.mp4") == code
     assert "fps: " in capsys.readouterr().err and not (tmp_path / "2.mp4").exists()
     with open_video((tmp_path / "0.mp4").read_bytes()) as container:
@@ -211,10 +211,10 @@ def test_overlay_of_recordings(run, recorded, tmp_path, capsys, monkeypatch):
 def test_a_signal_ends_a_monitor_at_work(run, tmp_path, capsys, monkeypatch, number):
     poses = tmp_path / "poses.csv"
     poses.write_text("time_s,x_m,y_m,heading_rad\n0,4,3,0\n900,4.1,3,0\n")
-    told = []
+    sent = []
 
     def send(server, pose) -> None:
-        told.append(pose)
+        sent.append(pose)
         signal.raise_signal(number)
 
     monkeypatch.setattr(FollowServer, "_tell", send)
@@ -223,7 +223,7 @@ def test_a_signal_ends_a_monitor_at_work(run, tmp_path, capsys, monkeypatch, num
     assert cli.main([*map(str, words), "--face", "left"]) == 0
     out, err = capsys.readouterr()
     assert out.endswith("Ended\n") and "Traceback" not in err
-    assert len(told) == 1
+    assert len(sent) == 1
 
 
 def test_what_is_no_box_is_refused(run, tmp_path, monkeypatch):
@@ -261,19 +261,19 @@ def exported(run, tmp_path_factory):
 def test_files_obey_the_schema_of_the_standard(exported, name, schema):
     xmlschema = pytest.importorskip("xmlschema")
     there = installed_files("scenariogeneration") or ()
-    (found,) = [path for path in there if path.name == schema]
-    xmlschema.validate(str(exported / name), str(found.locate()))
+    (schema_file,) = [path for path in there if path.name == schema]
+    xmlschema.validate(str(exported / name), str(schema_file.locate()))
 
 
 def test_another_reader_finds_car_object_and_route(run, exported):
     xosc = pytest.importorskip("scenariogeneration").xosc
     read = xosc.ParseOpenScenario(str(exported / "scenario.xosc"))
-    (found,) = read_found([run])
+    (attack,) = read_found([run])
     objects = {each.name: each.entityobject for each in read.entities.scenario_objects}
     assert set(objects) == {"ego", "ball"}
     assert objects["ball"].model3d == "ball.glb"
     assert read.roadnetwork.road_file == "route.xodr"
-    car = found.scenario.vehicle.car()
+    car = attack.scenario.vehicle.car()
     assert objects["ego"].axles.frontaxle.maxsteer == pytest.approx(car.max_steer)
     assert objects["ego"].boundingbox.boundingbox.width == pytest.approx(car.width)
     actions = read.storyboard.init.initactions
@@ -284,9 +284,9 @@ def test_another_reader_finds_car_object_and_route(run, exported):
         key=lambda each: np.abs(each.cross_track_m).max(),
     )
     assert [start.x, start.y, start.h] == pytest.approx(worst.states[0].tolist())
-    assert speed.speed == found.route.speed_ms
+    assert speed.speed == attack.route.speed_ms
     points = [[each.position.x, each.position.y] for each in route.route.waypoints]
-    np.testing.assert_allclose(points, found.route.points)
+    np.testing.assert_allclose(points, attack.route.points)
     # the object stands where the attack left it
     (teleport,) = actions["ball"]
     place = teleport.position
@@ -299,7 +299,7 @@ def test_another_reader_finds_car_object_and_route(run, exported):
     np.testing.assert_allclose(mesh.extents, 1.5, atol=0.1)
     # the lane is centred on the route
     road = ElementTree.parse(exported / "route.xodr").getroot().find("road")
-    assert float(road.get("length")) == pytest.approx(found.route.length)
+    assert float(road.get("length")) == pytest.approx(attack.route.length)
     offset, width = road.find("lanes/laneOffset"), road.find(".//right/lane/width")
     lane, shift = float(width.get("a")), float(offset.get("a"))
-    assert lane == found.route.lane_width_m and shift - lane / 2 == 0
+    assert lane == attack.route.lane_width_m and shift - lane / 2 == 0

@@ -38,7 +38,7 @@ FACES_SHOWN = """[...document.querySelectorAll("#faces img")].map(
 EYES = [[1.4, -0.9, 0.6], [2.6, -0.4, 0.9], [3.0, 0.2, 0.3]]
 
 
-class Told(AbstractTracker):
+class ScriptedTracker(AbstractTracker):
     """Has the pose that a test gives it."""
 
     def __init__(self) -> None:
@@ -88,21 +88,21 @@ def test_points_of_faces_lie_behind_their_pixels(eye, where):
         facing = np.cross(standing.down, standing.right)
         np.testing.assert_allclose(facing[:2], [np.cos(heading), np.sin(heading)])
     eye = np.array(eye)
-    found = follow.seen_faces(standing, BOX, eye)
+    faces = follow.seen_faces(standing, BOX, eye)
     camera, pose = virtual_camera(standing, eye)
-    assert found
+    assert faces
     for face in FACES:
         corner, across, down = BOX.plane(face)
         outward = np.cross(down, across)
-        assert (face in found) == ((eye - corner) @ outward > 0)
-    for face, matrix in found.items():
+        assert (face in faces) == ((eye - corner) @ outward > 0)
+    for face, matrix in faces.items():
         corner, across, down = BOX.plane(face)
         for u, v in ((0.0, 0.0), (1.0, 0.0), (0.3, 0.9)):
             x, y, z = (corner + u * across + v * down - eye) @ pose[:3, :3]
-            wanted = camera.cx + camera.fx * x / z, camera.cy + camera.fy * y / z
+            expected = camera.cx + camera.fx * x / z, camera.cy + camera.fy * y / z
             column = matrix @ [u, v, 1]
             assert column[2] > 0
-            assert column[:2] / column[2] == pytest.approx(wanted, abs=1e-6)
+            assert column[:2] / column[2] == pytest.approx(expected, abs=1e-6)
 
 
 def test_on_its_own_face_a_picture_stands_still():
@@ -119,16 +119,24 @@ def test_on_its_own_face_a_picture_stands_still():
     assert follow.seen_faces(STANDING, BOX, behind) == {}
 
 
-def serve(tracker: Told, told=print, page: str = "", port: int = 0, camera=(0.0,) * 3):
+def serve(
+    tracker: ScriptedTracker,
+    say=print,
+    page: str = "",
+    port: int = 0,
+    camera=(0.0,) * 3,
+):
     """Make a server of this computer; the tests' one call of its nine arguments."""
-    here, place = Endpoint("127.0.0.1", port), np.array(camera)
-    return follow.FollowServer(here, page, STANDING, BOX, tracker, "car", place, told)
+    endpoint, place = Endpoint("127.0.0.1", port), np.array(camera)
+    return follow.FollowServer(
+        endpoint, page, STANDING, BOX, tracker, "car", place, say
+    )
 
 
 @pytest.fixture
 def served():
     """A server, its tracker, what it says, and what ends it."""
-    tracker, said, errors = Told(), [], []
+    tracker, said, errors = ScriptedTracker(), [], []
     page = follow.follow_page(STANDING, BOX, (9, 8, 7))
     server = serve(tracker, said.append, page, camera=(0.1, 0.0, 0.2))
 
@@ -158,13 +166,13 @@ def test_each_new_pose_is_an_event(served):
             line = b""
             while not line.startswith(b"data: "):
                 line = events.readline()
-            told = json.loads(line[6:])
+            matrices = json.loads(line[6:])
             turned = [-0.0, 0.1, 0.2] if heading else [0.1, 0.0, 0.2]
-            wanted = follow.seen_faces(STANDING, BOX, np.array(eye) + turned)
-            assert list(told) == list(wanted)
-            for face, matrix in wanted.items():
-                found = np.reshape(told[face], (3, 3))
-                np.testing.assert_allclose(found, matrix, atol=1e-9)
+            expected = follow.seen_faces(STANDING, BOX, np.array(eye) + turned)
+            assert list(matrices) == list(expected)
+            for face, matrix in expected.items():
+                actual = np.reshape(matrices[face], (3, 3))
+                np.testing.assert_allclose(actual, matrix, atol=1e-9)
     wait_for(lambda: len(said) == 2)  # lost at first, then seen again
     with pytest.raises(urllib.error.HTTPError):
         urllib.request.urlopen(server.address + "other", timeout=20)
@@ -177,7 +185,7 @@ def test_each_new_pose_is_an_event(served):
 
 def test_it_ends_though_it_was_never_run():
     """As where nobody can be told its address, or by Ctrl-C meanwhile."""
-    thread = threading.Thread(target=serve(Told()).close, daemon=True)
+    thread = threading.Thread(target=serve(ScriptedTracker()).close, daemon=True)
     thread.start()
     thread.join(10)
     assert not thread.is_alive()
@@ -186,7 +194,7 @@ def test_it_ends_though_it_was_never_run():
 @pytest.mark.slow
 def test_a_browser_shows_what_the_camera_would_see(tmp_path):
     """Pixel by pixel, but for edges, as the overlay by the monitor's own camera."""
-    rng, tracker = np.random.default_rng(0), Told()
+    rng, tracker = np.random.default_rng(0), ScriptedTracker()
     tiles = {face: rng.integers(30, 255, (8, 8, 3)) for face in FACES}
     block = np.ones((32, 32, 1))
     images = {
@@ -194,9 +202,9 @@ def test_a_browser_shows_what_the_camera_would_see(tmp_path):
     }
     box = made_box(images, pose=BOX.pose)
     standing = follow.StandingScreen.on_face(SCREEN, box, "front")
-    text, here = follow.follow_page(standing, box), Endpoint("127.0.0.1", 0)
+    text, endpoint = follow.follow_page(standing, box), Endpoint("127.0.0.1", 0)
     server = follow.FollowServer(
-        here, text, standing, box, tracker, "car", np.zeros(3), print
+        endpoint, text, standing, box, tracker, "car", np.zeros(3), print
     )
     with closing(server), browser(tmp_path) as page:
         page.resize(SCREEN.width_px, SCREEN.height_px)
@@ -210,11 +218,11 @@ def test_a_browser_shows_what_the_camera_would_see(tmp_path):
             shown = files.read_image(shot)[..., :3]
             camera, pose = virtual_camera(standing, np.array(eye))
             overlay = Overlay(box, camera, keyed=False)
-            wanted = overlay.apply(np.zeros((360, 640, 3), np.uint8), pose)
-            far = np.abs(shown.astype(int) - wanted).max(2) > 60
-            covered = wanted.any(2)
+            expected = overlay.apply(np.zeros((360, 640, 3), np.uint8), pose)
+            far = np.abs(shown.astype(int) - expected).max(2) > 60
+            covered = expected.any(2)
             assert covered.mean() > 0.3
             # tiles are some 25 pixels wide, and all differ
             assert far.sum() < 0.02 * covered.sum()
             assert not binary_opening(far, np.ones((3, 3))).any()
-        assert page.told == []
+        assert page.messages == []

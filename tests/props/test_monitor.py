@@ -96,11 +96,11 @@ def test_page_in_a_browser(tmp_path, ratio):
             check=True,
         )
     shown = files.read_image(shot)[..., :3]
-    wanted = measured(image, screen)
+    expected = measured(image, screen)
     rows = slice(0, min(600, len(shown)))  # above the warning
     np.testing.assert_allclose(
         measured(np.where(shown == [255, 255, 0], 0, shown)[rows], screen)[:3],
-        wanted[:3],
+        expected[:3],
         atol=0.01,
     )
     np.testing.assert_array_equal(shown[200:500, :1280], image[200:500])

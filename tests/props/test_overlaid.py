@@ -76,8 +76,8 @@ def test_a_frame_shows_the_box_from_where_it_was_taken():
     sagitta = (SPEED * POSE_S) ** 2 / 8 / RADIUS
     # the first frame came before any pose later than it
     for place, frame in list(zip(overlay.places, frames.values(), strict=True))[1:]:
-        wanted = body_at(frame.time_s) @ camera_to_body(MOUNT)
-        assert np.abs(place - wanted).max() < 2 * sagitta
+        expected = body_at(frame.time_s) @ camera_to_body(MOUNT)
+        assert np.abs(place - expected).max() < 2 * sagitta
     assert frame.image.max() == 21
     camera.close()
     assert car.closed == 1

@@ -89,12 +89,12 @@ def poses(count: int) -> np.ndarray:
     return np.stack([look_at(eye, aim) for eye, aim in pairs])
 
 
-def farthest(found: np.ndarray, wanted: np.ndarray, told=True) -> float:
+def farthest(actual: np.ndarray, expected: np.ndarray, valid=True) -> float:
     """Return how far from the edges of a mask another differs from it, pixels."""
-    wrong = (found != wanted) & told
-    if not wrong.any() or wanted.all() or not wanted.any():
+    wrong = (actual != expected) & valid
+    if not wrong.any() or expected.all() or not expected.any():
         return float(wrong.any())
-    inner, outer = distance_transform_edt(wanted), distance_transform_edt(~wanted)
+    inner, outer = distance_transform_edt(expected), distance_transform_edt(~expected)
     return float((np.maximum(inner, outer) - 0.5)[wrong].max())  # pixels' centres
 
 
@@ -115,14 +115,14 @@ def test_within_a_pixel_of_a_render(camera):
         share = 1 - (on_white - on_black)
         near = binary_dilation(traced(box, coarse, matrix)[0], iterations=2)
         hit, white = np.zeros(shape), np.zeros(shape)
-        for mask, found in zip(
+        for mask, samples in zip(
             (hit, white), traced(box, rays[near], matrix), strict=False
         ):
-            mask[near] = found.mean(1)
+            mask[near] = samples.mean(1)
         inside = (share > 0.99) & (hit == 1)
-        told = inside & (np.abs(white - 0.5) > 0.1)
-        checks = farthest((on_black > middle) | ~inside, (white > 0.5) | ~inside, told)
-        worst.append((farthest(share > 0.5, hit > 0.5), checks, told.sum()))
+        valid = inside & (np.abs(white - 0.5) > 0.1)
+        checks = farthest((on_black > middle) | ~inside, (white > 0.5) | ~inside, valid)
+        worst.append((farthest(share > 0.5, hit > 0.5), checks, valid.sum()))
     edges, checks, pixels = np.array(worst).T
     assert edges.max() <= 1
     assert checks.max() <= 1
@@ -176,9 +176,9 @@ def test_within_a_pixel_of_the_field():
     edges, colours, voxels_px = [], [], []
     for matrix in poses(50):
         rays = Rays(*generate_rays(camera, *pose_arrays(matrix[None]), 1))
-        seen = march(posed, rays)
-        opacity = gathered(seen.opacity.numpy())[..., 0]
-        radiance = gathered(seen.radiance.numpy().T)
+        integrals = march(posed, rays)
+        opacity = gathered(integrals.opacity.numpy())[..., 0]
+        radiance = gathered(integrals.radiance.numpy().T)
         on_black, on_white = (
             light[overlay.apply(np.full((*shape, 3), v, np.uint8), matrix)]
             for v in (0, 255)
@@ -205,12 +205,12 @@ def test_what_is_nearer_hides_it():
     depth = np.full(hit.shape, np.inf, np.float32)
     depth[:, :90] = 0.5 * along[hit].min()
     shown = overlay.apply(frame, matrix, depth)
-    whole = overlay.apply(frame, matrix)
-    assert (shown[:, :90] == 77).all() and (whole[:, :90] != 77).any()
-    np.testing.assert_array_equal(shown[:, 90:], whole[:, 90:])
+    unhidden = overlay.apply(frame, matrix)
+    assert (shown[:, :90] == 77).all() and (unhidden[:, :90] != 77).any()
+    np.testing.assert_array_equal(shown[:, 90:], unhidden[:, 90:])
     # the depth of the box itself does not hide it
     own = np.where(hit, along, np.inf)
-    np.testing.assert_array_equal(overlay.apply(frame, matrix, own)[hit], whole[hit])
+    np.testing.assert_array_equal(overlay.apply(frame, matrix, own)[hit], unhidden[hit])
     # behind the camera, or with the camera in the box, there is nothing
     for eye in ((5.0, 5, 5), POSE.translation + [0, 0, 0.2]):
         shown = overlay.apply(frame, look_at(np.array(eye), np.array([9.0, 9, 9])))

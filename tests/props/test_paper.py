@@ -28,7 +28,7 @@ PICTURE = re.compile(
 
 def pdf_pages(path: Path) -> list[tuple[tuple[float, ...], list[Rectangle]]]:
     """Return the size of each page, and where its pictures lie, millimetres."""
-    raw, found = path.read_bytes(), []
+    raw, layouts = path.read_bytes(), []
     pages = re.findall(rb"/MediaBox\s\[\s0\s0\s([^\]]+)\]\s/Contents\s(\d+)\s0\sR", raw)
     for size, number in pages:
         start = raw.index(b"\n%s 0 obj" % number)
@@ -40,8 +40,8 @@ def pdf_pages(path: Path) -> list[tuple[tuple[float, ...], list[Rectangle]]]:
             assert d == pytest.approx(-f)  # rows from the top
             pictures.append(Rectangle(x, y, a, f))
         assert text.count(b" Do") == len(pictures)
-        found.append((tuple(POINT_MM * float(v) for v in size.split()), pictures))
-    return found
+        layouts.append((tuple(POINT_MM * float(v) for v in size.split()), pictures))
+    return layouts
 
 
 def coloured(figure, colour, dpi: int = 150) -> tuple[float, float]:
@@ -96,16 +96,16 @@ def test_one_page_is_exact(tmp_path):
     assert paper.write_net(tmp_path / "a.pdf", box, edges) == 1
     ((size, pictures),) = pdf_pages(tmp_path / "a.pdf")
     np.testing.assert_allclose(size, (210, 297), atol=0.01)
-    found = sorted((p.width, p.height) for p in pictures)
-    wanted = [(30, 20), (30, 20), (40, 20), (40, 20), (40, 30), (40, 30)]
-    np.testing.assert_allclose(found, wanted, atol=0.01)
+    extents = sorted((p.width, p.height) for p in pictures)
+    expected = [(30, 20), (30, 20), (40, 20), (40, 20), (40, 30), (40, 30)]
+    np.testing.assert_allclose(extents, expected, atol=0.01)
     assert b"/Width 472" in (tmp_path / "a.pdf").read_bytes()  # 40 mm of 300 dpi
     (figure,) = paper.pages(
         box, Net(edges), paper.lay_out(Net(edges), "a4"), edges, 150
     )
     x, y, z = edges
-    for face, wanted in (("front", (x, z)), ("left", (y, z)), ("top", (x, y))):
-        np.testing.assert_allclose(coloured(figure, COLOURS[face]), wanted, atol=0.5)
+    for face, expected in (("front", (x, z)), ("left", (y, z)), ("top", (x, y))):
+        np.testing.assert_allclose(coloured(figure, COLOURS[face]), expected, atol=0.5)
     # the ruler, whose outermost ticks are the only black from 12 to 16 mm
     pixels = np.asarray(figure.canvas.buffer_rgba())[..., 0]
     at = pixels.shape[0] - round(15.5 * 150 / 25.4)
@@ -137,15 +137,17 @@ def test_pages_that_overlap_add_up(tmp_path, name):
     pages = pdf_pages(tmp_path / "a.pdf")
     assert len(pages) == count == len(sheets.tiles) + 1 > 2
     margin, foot = 10.0, 24.0
-    parts = []
+    rectangles = []
     for tile, ((width, height), pictures) in zip(sheets.tiles, pages[1:], strict=True):
         assert sorted((width, height)) == pytest.approx(paper.PAPERS[name], abs=0.01)
         dx, dy = tile.part.left - margin, tile.part.bottom - foot
         for p in pictures:
             assert p.left > margin - 0.01 and p.right < width - margin + 0.01
-            parts.append(Rectangle(p.left + dx, p.bottom + dy, p.width, p.height))
+            rectangles.append(Rectangle(p.left + dx, p.bottom + dy, p.width, p.height))
     for face in net.faces.values():
-        own = [p for p in parts if (c := p.common(face)) and c.width * c.height > 0.1]
+        own = [
+            p for p in rectangles if (c := p.common(face)) and c.width * c.height > 0.1
+        ]
         covered = np.zeros((120, 120), bool)
         for p in own:
             x0, y0 = p.left - face.left, p.bottom - face.bottom

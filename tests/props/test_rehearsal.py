@@ -185,17 +185,17 @@ def test_images_come_in_step_with_the_clock():
         view, mount, car.pose, lambda: car.time_s, seed=(1 << 32) - 2
     )
     assert camera.camera is view.camera
-    states, seen = [], []
+    states, frames = [], []
     for step in range(60):  # at 50 Hz
         frame = camera.newest()
         assert frame is not None
-        if frame.index != (seen[-1].index if seen else -1):
-            seen.append(frame)
+        if frame.index != (frames[-1].index if frames else -1):
+            frames.append(frame)
             states.append(car.state())
             assert frame.time_s == car.time_s
-        assert frame is seen[-1] and frame.index == step // 5
+        assert frame is frames[-1] and frame.index == step // 5
         car.time_s += 0.02
-    assert len(seen) == 12 and seen[0].image.shape == (2, 4, 3)
+    assert len(frames) == 12 and frames[0].image.shape == (2, 4, 3)
     expected = mount_matrix(np.array(states), mount)
     assert np.array(view.places) == pytest.approx(expected, abs=1e-9)
     assert view.seeds == [*range((1 << 32) - 2, 1 << 32), *range(10)]

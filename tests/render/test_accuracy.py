@@ -46,17 +46,17 @@ def test_overlapping_boxes_interleaved() -> None:
         black.append((*layer, 0 * colour))
     (a, b, *_), (near, far, *_) = layers
     assert 0.3 < (np.minimum(b, far) > np.maximum(a, near)).mean() < 1
-    seen = InterleavedComposite().render(posed, rays, 0.0)
+    marches = InterleavedComposite().render(posed, rays, 0.0)
     radiance, opacity, moment = piecewise(layers)
-    found = seen.total
-    np.testing.assert_allclose(found.radiance.numpy().T, radiance, rtol=1e-4, atol=1e-7)
-    np.testing.assert_allclose(found.opacity.numpy(), opacity, rtol=1e-4, atol=1e-7)
+    total = marches.total
+    np.testing.assert_allclose(total.radiance.numpy().T, radiance, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(total.opacity.numpy(), opacity, rtol=1e-4, atol=1e-7)
     hit = opacity > 0
     depth = np.where(hit, moment / np.where(hit, opacity, 1), np.inf)
-    np.testing.assert_allclose(found.depth.numpy(), depth, rtol=1e-3)
+    np.testing.assert_allclose(total.depth.numpy(), depth, rtol=1e-3)
     # Each share is the medium with the other's colour black.
     for k, pair in enumerate(([layers[0], black[1]], [black[0], layers[1]])):
-        share = seen.layers[k].radiance.numpy().T
+        share = marches.layers[k].radiance.numpy().T
         np.testing.assert_allclose(share, piecewise(pair)[0], rtol=1e-4, atol=1e-7)
 
 
@@ -167,8 +167,8 @@ def test_rays_that_leave_the_box_see_the_sky(tmp_path: Path, angle: float) -> No
 # Bounds of the error
 
 
-def numbers(seen: March) -> list[np.ndarray]:
-    arrays = (seen.radiance, seen.opacity, seen.moment)
+def numbers(integrals: March) -> list[np.ndarray]:
+    arrays = (integrals.radiance, integrals.opacity, integrals.moment)
     return [a.numpy().astype(np.float64).T for a in arrays]
 
 
@@ -186,13 +186,13 @@ def test_error_falls_by_four_when_the_step_halves(overlap: bool) -> None:
         for field, _ in blobs:
             field.step_m = step
         posed = [PosedField(*blob) for blob in blobs]
-        seen = InterleavedComposite().render(posed, rays, 0.0).total
+        integrals = InterleavedComposite().render(posed, rays, 0.0).total
         if not overlap:
-            seen = march(posed[0], rays, 0.0)
+            integrals = march(posed[0], rays, 0.0)
         return np.array(
             [
                 np.sqrt(np.mean((a - b) ** 2))
-                for a, b in zip(numbers(seen), expected, strict=True)
+                for a, b in zip(numbers(integrals), expected, strict=True)
             ]
         )
 
@@ -206,7 +206,7 @@ def test_error_falls_by_four_when_the_step_halves(overlap: bool) -> None:
 def test_step_bounds_the_error(step: float, peak: float) -> None:
     field = GaussianField(peak, 0.5, 0.7, step)
     rays, o, d = rays_towards(np.zeros(3), 0.5, 256)
-    seen = numbers(march(PosedField(field), rays, 0.0))
+    actual = numbers(march(PosedField(field), rays, 0.0))
     expected = quadrature([(field, Pose.identity())], o, d)
     near, far = box_interval(o, d, Pose.identity(), field.half)
     length = far - near
@@ -218,7 +218,7 @@ def test_step_bounds_the_error(step: float, peak: float) -> None:
         return e * (l0 + length * l1) + step**2 * local
 
     limits = [bound(*field.colour)[:, None], e, bound(far, 1.0, 0.0)]
-    for a, b, limit in zip(seen, expected, limits, strict=True):
+    for a, b, limit in zip(actual, expected, limits, strict=True):
         error = np.abs(a - b)
         assert np.all(error <= limit + 1e-6)
         assert np.max(error / limit) > 1e-3  # the bound means something
@@ -240,7 +240,7 @@ def test_step_bounds_the_error_at_kinks(step: float) -> None:
 
     start = rng.uniform(2, 3, 32).astype(np.float32)  # the lattice starts at the eye
     origin = mi.Point3f(-mi.Float(start), 0.13, -0.4)
-    seen = march(PosedField(field), Rays(origin, mi.Vector3f(1, 0, 0)), 0.0)
+    integrals = march(PosedField(field), Rays(origin, mi.Vector3f(1, 0, 0)), 0.0)
     inner = planes[(planes > -1) & (planes < 1)]
     x = np.concatenate([[-1], inner, [1]])
     log = np.interp(x, planes, height)
@@ -250,7 +250,7 @@ def test_step_bounds_the_error_at_kinks(step: float) -> None:
     left, right = slope * density[:-1], slope * density[1:]
     variation = np.abs(right - left).sum() + np.abs(left[1:] - right[:-1]).sum()
     limit = step**2 * variation / 8
-    error = np.abs(seen.opacity.numpy().astype(float) + np.expm1(-tau))
+    error = np.abs(integrals.opacity.numpy().astype(float) + np.expm1(-tau))
     assert np.all(error <= limit + 1e-6)
     assert np.max(error) > 1e-3 * limit
 
@@ -259,13 +259,13 @@ def test_step_bounds_the_error_at_kinks(step: float) -> None:
     through = np.exp(-cumulative_trapezoid(sigma, fine, initial=0))
     s0, s1 = sigma.max(), np.abs(np.gradient(sigma, fine)).max()
     e = limit + step**2 * s1 / 4
-    for found, raw in zip(seen.radiance.numpy(), colours.T, strict=True):
+    for radiance, raw in zip(integrals.radiance.numpy(), colours.T, strict=True):
         colour = small.sigmoid_to_linear(np.interp(fine, planes, raw))
         slope = np.diff(colour) / np.diff(fine)
         l0, l1, turns = colour.max(), np.abs(slope).max(), np.abs(np.diff(slope)).sum()
         local = s0 * (l1 * (1 + s0 * step) / 12 + turns / 4)
         most = e * (l0 + 2 * l1) + step**2 * local
-        error = np.abs(found - np.trapezoid(sigma * through * colour, fine))
+        error = np.abs(radiance - np.trapezoid(sigma * through * colour, fine))
         assert np.all(error <= most + 1e-6)
         assert np.max(error) > 1e-4 * most
 

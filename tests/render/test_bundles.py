@@ -82,9 +82,9 @@ def test_the_way_is_empty_and_the_march_the_same(
     rays = camera(origin, towards, 5 * BUNDLE + 3, 0.05, shift)
     clear = clear_of(posed, rays)
     assert_empty(posed, rays, clear)
-    found, expected = FieldMarch(posed, 1e-4).march(rays), march(posed, rays, 1e-4)
+    actual, expected = FieldMarch(posed, 1e-4).march(rays), march(posed, rays, 1e-4)
     for name in ("radiance", "opacity", "moment"):
-        pair = [np.array(getattr(item, name)) for item in (found, expected)]
+        pair = [np.array(getattr(item, name)) for item in (actual, expected)]
         np.testing.assert_array_equal(*pair)
 
 
@@ -108,23 +108,23 @@ def test_most_of_a_street_is_crossed_together():
     posed = PosedField(load_field(bundled(STREET)))
     rays = camera((-14.0, -1.75, 1.2), (1.0, 0.0, -0.1), 100 * BUNDLE, 0.8)
     clear = clear_of(posed, rays)
-    seen = march(posed, rays)
+    integrals = march(posed, rays)
     assert clear.shape == (100 * BUNDLE,)
     assert_empty(posed, rays, clear)
-    share = clear / seen.depth.numpy()
+    share = clear / integrals.depth.numpy()
     assert np.median(share) > 0.7
     assert share.max() < 1.2  # it ends where something is seen
 
 
 def test_a_wider_bundle_is_clear_for_less(rng):
     posed = PosedField(sparse(rng, octants=False))
-    found = []
+    lengths = []
     for spread in (0.01, 0.3, 40.0):
         rays = camera((0.05, 0.1, -0.1), (1.0, 0.3, 0.1), BUNDLE, spread)
         clear = clear_of(posed, rays)
         assert_empty(posed, rays, clear)
-        found.append(clear.max())
-    assert found[0] > found[1] > found[2]
+        lengths.append(clear.max())
+    assert lengths[0] > lengths[1] > lengths[2]
 
 
 def test_fields_without_an_empty_cell_and_with_nothing_else():

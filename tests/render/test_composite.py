@@ -13,7 +13,7 @@ from support.worlds import fields as small
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.composite import (
     DepthComposite,
-    Seen,
+    Marches,
     depth_composite,
     sort_by_depth,
 )
@@ -47,8 +47,8 @@ def test_order_is_chosen_ray_by_ray() -> None:
     ones = mi.Float([1, 1])
     red = March(mi.Color3f(1, 0, 0) * ones, ones, mi.Float([1, 5]))
     blue = March(mi.Color3f(0, 0, 1) * ones, ones, mi.Float([3, 3]))
-    seen = depth_composite([red, blue]).radiance.numpy()
-    np.testing.assert_array_equal(seen, [[1, 0], [0, 0], [0, 1]])
+    radiance = depth_composite([red, blue]).radiance.numpy()
+    np.testing.assert_array_equal(radiance, [[1, 0], [0, 0], [0, 1]])
 
 
 @settings(max_examples=30)
@@ -83,11 +83,11 @@ def test_any_layers_against_a_sequential_fold(layers) -> None:
     assert depth == pytest.approx(expected, rel=1e-5)
     depths = [float(m.depth[0]) for m in sort_by_depth(marches)]
     assert depths == sorted(depths)
-    shares = DepthComposite().shares(Seen(depth_composite(marches), marches))
+    shares = DepthComposite().shares(Marches(depth_composite(marches), marches))
     for name in ("radiance", "opacity", "moment"):
-        parts = sum(np.array(getattr(share, name)) for share in shares)
-        whole = np.array(getattr(depth_composite(marches), name))
-        np.testing.assert_allclose(parts, whole, atol=1e-5)
+        summed = sum(np.array(getattr(share, name)) for share in shares)
+        composed = np.array(getattr(depth_composite(marches), name))
+        np.testing.assert_allclose(summed, composed, atol=1e-5)
 
 
 def test_a_march_differs_from_nothing_in_any_part() -> None:
@@ -117,8 +117,8 @@ def make_rays(rng: np.random.Generator, t_max: float = 10.0) -> Rays:
     return Rays(origin, direction, far, jitter, mi.Bool(True))
 
 
-def as_rows(seen: March) -> np.ndarray:
-    rows = [*seen.radiance, seen.opacity, seen.moment]
+def as_rows(integrals: March) -> np.ndarray:
+    rows = [*integrals.radiance, integrals.opacity, integrals.moment]
     return np.stack([np.array(row) for row in rows])
 
 
@@ -154,8 +154,8 @@ def test_fields_apart_are_the_depth_composite(rng: np.random.Generator) -> None:
 )
 def test_nothing_is_seen(rng, move, t_max) -> None:
     fields = [PosedField(small.blob(rng), Pose.upright(move, 0.0)) for _ in range(2)]
-    seen = InterleavedComposite().render(fields, make_rays(rng, t_max), 0.0).total
-    assert (as_rows(seen) == 0).all() and (seen.depth.numpy() == np.inf).all()
+    integrals = InterleavedComposite().render(fields, make_rays(rng, t_max), 0.0).total
+    assert (as_rows(integrals) == 0).all() and (integrals.depth.numpy() == np.inf).all()
 
 
 def test_opaque_box_inside_fog(rng: np.random.Generator) -> None:
@@ -163,9 +163,9 @@ def test_opaque_box_inside_fog(rng: np.random.Generator) -> None:
     box = PosedField(small.homogeneous(1e5, 1.0), Pose.upright((0, 0, 0), 0.0, 0.3))
     rays = make_rays(rng)
     rays.origin, rays.direction = mi.Point3f(-3, 0.1, 0.1), mi.Vector3f(1, 0, 0)
-    seen = InterleavedComposite().render([fog, box], rays, 0.0)
+    marches = InterleavedComposite().render([fog, box], rays, 0.0)
     passed = np.exp(-0.5 * 0.7)  # from x = -1 to x = -0.3
     raw = small.sigmoid_to_linear(np.array([-1.0, 1.0]))
     expected = (1 - passed) * raw[0] + passed * raw[1]
-    assert seen.total.opacity[0] == pytest.approx(1, abs=1e-6)
-    np.testing.assert_allclose(seen.total.radiance.numpy(), expected, rtol=2e-4)
+    assert marches.total.opacity[0] == pytest.approx(1, abs=1e-6)
+    np.testing.assert_allclose(marches.total.radiance.numpy(), expected, rtol=2e-4)

@@ -38,12 +38,12 @@ def blurred(image, blurs):
 @pytest.mark.parametrize("largest", [0.02, 2.3, 5.0])  # beyond the image, too
 def test_blur_is_that_of_scipy(image, largest):
     blurs = np.array([0.0, 0.4 * largest, largest])
-    found = np.array(blur(row_type()(image.ravel()), SHAPE, blurs)).reshape(SHAPE)
+    actual = np.array(blur(row_type()(image.ravel()), SHAPE, blurs)).reshape(SHAPE)
     # Dr.Jit keeps weights in single precision
-    np.testing.assert_allclose(found, blurred(image, blurs), rtol=0, atol=3e-7)
+    np.testing.assert_allclose(actual, blurred(image, blurs), rtol=0, atol=3e-7)
     for k in range(3):  # each image is blurred as in a batch
         alone = blur(row_type()(image[k].ravel()), (1, *SHAPE[1:]), blurs[k : k + 1])
-        assert np.array_equal(np.array(alone), found[k].ravel())
+        assert np.array_equal(np.array(alone), actual[k].ravel())
 
 
 def test_light_is_blurred_and_exposed_and_values_get_noise(image):
@@ -52,10 +52,10 @@ def test_light_is_blurred_and_exposed_and_values_get_noise(image):
     value = linear_to_srgb_numpy(light * 2.0 ** exposures[:, None, None])
     noise = np.array(standard_normal(row_type(), SHAPE, 7, 2)).reshape(SHAPE)
     expected = np.clip(value + 0.04 * noise, 0, 1)
-    given = tensor(image)
+    frame = tensor(image)
     for _ in range(2):  # the image stays as it is
-        found = np.array(ALL.apply(given, 2))
-        np.testing.assert_allclose(found, expected, atol=2e-6)
+        disturbed = np.array(ALL.apply(frame, 2))
+        np.testing.assert_allclose(disturbed, expected, atol=2e-6)
     assert (expected == 1).any() and (value > 1 - 1e-9).any()  # some is clipped
 
 
@@ -90,12 +90,12 @@ def test_noise_is_normal_and_independent_of_pixel_row_step_and_seed():
     assert np.array_equal(alone, first[0].ravel())  # whatever the batch
 
 
-@pytest.mark.parametrize("parts", [SIZES, *((name,) for name in SIZES)])
-def test_derivatives_are_exact(image, rng, parts):
-    kept = {name: getattr(ALL, name) for name in parts}
-    disturbance = Disturbance(seed=7, **kept)
-    given, weight = tensor(image), rng.normal(size=SHAPE)
-    by_image = np.array(disturbance.vjp(given, 1, tensor(weight)))
+@pytest.mark.parametrize("names", [SIZES, *((name,) for name in SIZES)])
+def test_derivatives_are_exact(image, rng, names):
+    sizes = {name: getattr(ALL, name) for name in names}
+    disturbance = Disturbance(seed=7, **sizes)
+    frame, weight = tensor(image), rng.normal(size=SHAPE)
+    by_image = np.array(disturbance.vjp(frame, 1, tensor(weight)))
     along = rng.normal(size=SHAPE)
     expected = (by_image * along).sum()
 
@@ -109,15 +109,15 @@ def test_derivatives_are_exact(image, rng, parts):
 
 def test_other_steps_and_sizes_compile_nothing():
     # memory of NumPy's may be aligned in any way, for which there are other kernels
-    given = mi.TensorXf(dr.linspace(mi.Float, 0, 1, int(np.prod(SHAPE))), SHAPE)
-    dr.eval(given)
+    frame = mi.TensorXf(dr.linspace(mi.Float, 0, 1, int(np.prod(SHAPE))), SHAPE)
+    dr.eval(frame)
 
     def work(disturbance, step):
-        np.array(disturbance.apply(given, step))
-        np.array(disturbance.vjp(given, step, given))
+        np.array(disturbance.apply(frame, step))
+        np.array(disturbance.vjp(frame, step, frame))
 
     work(ALL, 0)
-    value = given.array
+    value = frame.array
     np.array(blur(value, SHAPE, np.array([0.5, 1.0, 0.5])))
     with nothing_compiled():
         work(replace(ALL, noise_sd=0.1, exposure_ev_sd=0.2), 5)
@@ -126,8 +126,8 @@ def test_other_steps_and_sizes_compile_nothing():
 
 def test_nothing_is_disturbed_by_default_and_sizes_are_checked(image):
     assert not Disturbance(seed=3)
-    found = np.array(Disturbance().apply(tensor_type()(image), 0))
-    assert np.array_equal(found, image)
+    unchanged = np.array(Disturbance().apply(tensor_type()(image), 0))
+    assert np.array_equal(unchanged, image)
     with pytest.raises(InputError) as caught:
         Disturbance(noise_sd=-0.1)
     assert caught.value.where == "Disturbance.noise_sd"

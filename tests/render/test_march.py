@@ -55,14 +55,14 @@ def slab(near: float, length: float, sigma: float = SIGMA) -> tuple[float, float
     ],
 )
 def test_slab(start, t_max, near, length, jitter) -> None:
-    seen = along_x(small.homogeneous(SIGMA), x=start, t_max=t_max, jitter=jitter)
+    integrals = along_x(small.homogeneous(SIGMA), x=start, t_max=t_max, jitter=jitter)
     opacity, depth = slab(near, length)
     colour = small.sigmoid_to_linear(np.array(0.3))
-    assert seen.opacity[0] == pytest.approx(opacity, rel=1e-4)
-    np.testing.assert_allclose(seen.radiance.numpy(), opacity * colour, rtol=2e-4)
+    assert integrals.opacity[0] == pytest.approx(opacity, rel=1e-4)
+    np.testing.assert_allclose(integrals.radiance.numpy(), opacity * colour, rtol=2e-4)
     # A sample stands at jitter, the mean of its short interval near the middle.
     offset = (jitter - 0.5) * 0.01
-    assert seen.depth[0] == pytest.approx(depth + offset, abs=2e-4)
+    assert integrals.depth[0] == pytest.approx(depth + offset, abs=2e-4)
 
 
 @pytest.mark.parametrize(
@@ -76,9 +76,9 @@ def test_slab(start, t_max, near, length, jitter) -> None:
     ],
 )
 def test_rays_that_miss_are_empty_and_infinitely_far(kwargs) -> None:
-    seen = along_x(small.homogeneous(), **kwargs)
-    assert seen.opacity[0] == 0 and seen.depth[0] == np.inf
-    assert (seen.radiance.numpy() == 0).all() and seen.moment[0] == 0
+    integrals = along_x(small.homogeneous(), **kwargs)
+    assert integrals.opacity[0] == 0 and integrals.depth[0] == np.inf
+    assert (integrals.radiance.numpy() == 0).all() and integrals.moment[0] == 0
 
 
 @quick
@@ -93,16 +93,16 @@ def test_any_pose_against_the_float64_reference(scale, angles, seed) -> None:
     turn = Rotation.from_euler("zyx", angles).as_matrix()
     pose = Pose(turn, np.array([0.2, 0.1, -0.1]), scale)
     o, d, origin, direction = small.fan(rng, 2)
-    seen = march(*small.arguments(PosedField(field, pose), o, d), 0.0)
+    integrals = march(*small.arguments(PosedField(field, pose), o, d), 0.0)
     for k in range(2):
         colour, opacity, moment = small.reference_march(
             field, pose, origin[k], direction[k], 10.0, 2000
         )
         # The midpoint rule errs by (step / blob)^2.
-        assert seen.opacity[k] == pytest.approx(opacity, rel=5e-3, abs=1e-4)
-        assert seen.moment[k] == pytest.approx(moment, rel=5e-3, abs=1e-3)
-        found = seen.radiance.numpy()[:, k]
-        np.testing.assert_allclose(found, colour, rtol=1e-2, atol=1e-4)
+        assert integrals.opacity[k] == pytest.approx(opacity, rel=5e-3, abs=1e-4)
+        assert integrals.moment[k] == pytest.approx(moment, rel=5e-3, abs=1e-3)
+        radiance = integrals.radiance.numpy()[:, k]
+        np.testing.assert_allclose(radiance, colour, rtol=1e-2, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -118,12 +118,12 @@ def test_any_pose_against_the_float64_reference(scale, angles, seed) -> None:
 def test_other_slabs(sigma, step, cone, near, opacity_error, depth_error) -> None:
     field = small.homogeneous(sigma)
     field.cone, field.step_m = cone, step
-    seen = along_x(field, x=-1 - near, t_max=100)
+    integrals = along_x(field, x=-1 - near, t_max=100)
     opacity, depth = slab(near, 2, sigma)
     radiance = opacity * small.sigmoid_to_linear(np.array(0.3))
-    assert seen.opacity[0] == pytest.approx(opacity, rel=opacity_error)
-    assert seen.radiance.x[0] == pytest.approx(radiance, rel=opacity_error)
-    assert seen.depth[0] == pytest.approx(depth, abs=depth_error)
+    assert integrals.opacity[0] == pytest.approx(opacity, rel=opacity_error)
+    assert integrals.radiance.x[0] == pytest.approx(radiance, rel=opacity_error)
+    assert integrals.depth[0] == pytest.approx(depth, abs=depth_error)
 
 
 # Lattice and poses
@@ -150,19 +150,19 @@ def test_a_transform_that_changes_is_followed() -> None:
     assert posed.pose.scale == pytest.approx(2) and not posed.offset.any()
     origin, direction = mi.Point3f(-5, 0.1, 0.2), mi.Vector3f(1, 0, 0)
     dr.make_opaque(origin, direction)
-    seen = march(*small.arguments(posed, origin, direction), 0.0)
+    integrals = march(*small.arguments(posed, origin, direction), 0.0)
     # twice as large from x = -1.5 on, and half as dense
     opacity, depth = slab(3.5, 4, SIGMA / 2)
-    assert seen.opacity[0] == pytest.approx(opacity, rel=1e-4)
-    assert seen.depth[0] == pytest.approx(depth, abs=2e-4)
+    assert integrals.opacity[0] == pytest.approx(opacity, rel=1e-4)
+    assert integrals.depth[0] == pytest.approx(depth, abs=2e-4)
 
 
 def test_footprints_are_where_boxes_stand() -> None:
     corners = np.array([-1.0, -2, 0]), np.array([3.0, 4, 1])
     field = GridField(GridLayout(1, 4, 4), *corners)
     pose = Pose.upright((10, 20, 5), np.pi / 2, 2.0)  # (x, y) to (10 - 2 y, 20 + 2 x)
-    (found,) = object_footprints([PosedField(field, pose)])
-    np.testing.assert_allclose(found, [[14, 18], [14, 26], [2, 26], [2, 18]])
+    (footprint,) = object_footprints([PosedField(field, pose)])
+    np.testing.assert_allclose(footprint, [[14, 18], [14, 26], [2, 26], [2, 18]])
 
 
 TRANSPOSED = np.eye(4)
@@ -226,9 +226,9 @@ def test_density_falls_to_zero_in_empty_cells() -> None:
     field.occupy(Occupancy(cells))
     # The factor, t^4 over a 16th of the cell on either side, takes a tenth away.
     opacity, depth = slab(3.025, 0.45)
-    seen = along_x(field)
-    assert seen.opacity[0] == pytest.approx(opacity, abs=SIGMA * 0.01)
-    assert seen.depth[0] == pytest.approx(depth, abs=0.01)
+    integrals = along_x(field)
+    assert integrals.opacity[0] == pytest.approx(opacity, abs=SIGMA * 0.01)
+    assert integrals.depth[0] == pytest.approx(depth, abs=0.01)
 
 
 # What is compiled

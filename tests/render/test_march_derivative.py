@@ -13,7 +13,7 @@ from support.worlds import fields as small
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import AbstractField, GridField, GridLayout, Occupancy
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.render.composite import DepthComposite, Seen
+from mi_nerfattack.render.composite import DepthComposite, Marches
 from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.render.march import march, march_derivative
 from mi_nerfattack.render.posed import PosedField
@@ -40,18 +40,18 @@ class Case:
         self.cotangent = small.random_march(rng, COUNT)
 
     def objective(self) -> float:
-        seen = self.composite.render(self.layers, self.rays, 0.0)
-        return small.pairing(seen.total, self.cotangent)
+        primal = self.composite.render(self.layers, self.rays, 0.0)
+        return small.pairing(primal.total, self.cotangent)
 
     def backward(self) -> None:
-        seen = self.composite.render(self.layers, self.rays, 0.0)
-        cotangent = Seen(self.cotangent)
-        self.composite.backward(self.layers, self.rays, seen, cotangent, 0.0)
+        primal = self.composite.render(self.layers, self.rays, 0.0)
+        cotangent = Marches(self.cotangent)
+        self.composite.backward(self.layers, self.rays, primal, cotangent, 0.0)
 
     def forward(self) -> float:
-        seen = self.composite.render(self.layers, self.rays, 0.0)
-        found = self.composite.forward(self.layers, self.rays, seen, 0.0)
-        return small.pairing(found.total, self.cotangent)
+        primal = self.composite.render(self.layers, self.rays, 0.0)
+        derivative = self.composite.forward(self.layers, self.rays, primal, 0.0)
+        return small.pairing(derivative.total, self.cotangent)
 
     def gradients(self) -> list[np.ndarray]:
         """Differentiate by the first field's parameters, by origin and direction."""
@@ -61,11 +61,11 @@ class Case:
         if is_grid:
             dr.enable_grad(packed)
             field.packed = packed
-        seen = self.composite.render(self.layers, self.rays, 0.0)
-        given = self.layers, self.rays, seen, Seen(self.cotangent)
-        (by_rays,) = self.composite.backward_rays(*given, 0.0, [0])
-        found = [dr.grad(packed), by_rays.origin, by_rays.direction]
-        return [value.numpy().copy() for value in found]
+        primal = self.composite.render(self.layers, self.rays, 0.0)
+        arguments = self.layers, self.rays, primal, Marches(self.cotangent)
+        (by_rays,) = self.composite.backward_rays(*arguments, 0.0, [0])
+        gradients = [dr.grad(packed), by_rays.origin, by_rays.direction]
+        return [value.numpy().copy() for value in gradients]
 
 
 @pytest.fixture
@@ -164,8 +164,8 @@ def check_rays(case: Case, rng, h: float, tolerance: float) -> None:
 
         expected = central_difference(shifted, h)
         setattr(case.rays, name, before)
-        found = float((gradient.astype(float) * tangent).sum())
-        assert found == pytest.approx(expected, rel=tolerance, abs=1e-3)
+        derivative = float((gradient.astype(float) * tangent).sum())
+        assert derivative == pytest.approx(expected, rel=tolerance, abs=1e-3)
 
 
 def test_derivative_by_the_density_of_a_slab() -> None:
@@ -173,11 +173,11 @@ def test_derivative_by_the_density_of_a_slab() -> None:
     origin = mi.Point3f([-3, -3], [0.1, 5], 0.2)
     posed = PosedField(small.homogeneous(0.7))
     rays = small.arguments(posed, origin, mi.Vector3f(1, 0, 0) + 0 * origin)[1]
-    seen = march(posed, rays, 0.0)
+    primal = march(posed, rays, 0.0)
     one = mi.Float(1, 1)
     cotangent = March(mi.Color3f(0.5, -2, 1) * one, 0.3 * one, -0.4 * one)
     backward = dr.ADMode.Backward
-    _, found = march_derivative(backward, posed, rays, seen, cotangent, 0.0, True)
+    _, by_ray = march_derivative(backward, posed, rays, primal, cotangent, 0.0, True)
     colour = small.sigmoid_to_linear(np.array(0.3))
 
     def objective(s: float) -> float:
@@ -187,7 +187,7 @@ def test_derivative_by_the_density_of_a_slab() -> None:
         return (-0.5 * colour + 0.3) * (1 - passed) - 0.4 * moment
 
     expected = [central_difference(objective, 1e-4), 0]
-    np.testing.assert_allclose(found.log_density.numpy(), expected, rtol=1e-3)
+    np.testing.assert_allclose(by_ray.log_density.numpy(), expected, rtol=1e-3)
 
 
 def test_origin_and_direction_within_one_cell(rng: np.random.Generator) -> None:
@@ -202,14 +202,14 @@ def test_bricks_have_no_derivatives_by_rays(rng) -> None:
     back, front = PosedField(small.small_bricks(rng)), PosedField(small.blob(rng))
     layers, composite = [back, front], DepthComposite()
     rays = Rays(*small.fan(rng)[:2])
-    seen = composite.render(layers, rays, 0.0)
-    cotangent = Seen(small.random_march(rng, dr.width(rays.direction)))
+    primal = composite.render(layers, rays, 0.0)
+    cotangent = Marches(small.random_march(rng, dr.width(rays.direction)))
     with pytest.raises(InputError, match="keep the camera detached") as caught:
-        composite.backward_rays(layers, rays, seen, cotangent, 0.0, [0, 1])
+        composite.backward_rays(layers, rays, primal, cotangent, 0.0, [0, 1])
     assert caught.value.where == "brick_field"
     # the objects among them have such derivatives, which poses are attacked by
-    (found,) = composite.backward_rays(layers, rays, seen, cotangent, 0.0, [1])
-    by_origin = found.origin.numpy()
+    (by_rays,) = composite.backward_rays(layers, rays, primal, cotangent, 0.0, [1])
+    by_origin = by_rays.origin.numpy()
     assert np.isfinite(by_origin).all() and by_origin.any()
 
 
@@ -245,12 +245,12 @@ def test_rays_that_miss_have_zero_gradient(blob: Case) -> None:
 
 @pytest.mark.parametrize("density", [1e-6, 1e4])
 def test_gradient_is_finite_near_opacity_0_and_1(rng, density: float) -> None:
-    found = Case(rng, small.homogeneous(density)).gradients()
-    assert all(np.isfinite(value).all() for value in found)
-    assert np.abs(found[0]).max() > 0
+    gradients = Case(rng, small.homogeneous(density)).gradients()
+    assert all(np.isfinite(value).all() for value in gradients)
+    assert np.abs(gradients[0]).max() > 0
 
 
 def test_march_itself_records_nothing(blob: Case) -> None:
     dr.enable_grad(blob.layers[0].field.packed)
-    seen = march(blob.layers[0], blob.rays, 0.0)
-    assert not dr.grad_enabled(seen.radiance, seen.opacity, seen.moment)
+    integrals = march(blob.layers[0], blob.rays, 0.0)
+    assert not dr.grad_enabled(integrals.radiance, integrals.opacity, integrals.moment)

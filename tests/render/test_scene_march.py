@@ -55,10 +55,10 @@ def road_rays(x: float = -10.0) -> Rays:
 
 
 def assert_same(posed: PosedField, rays: Rays, stop: float = STOP) -> None:
-    found = PackedMarch(posed, stop).march(rays)
+    actual = PackedMarch(posed, stop).march(rays)
     expected = march(posed, rays, stop)
     for name, atol in (("radiance", 2e-5), ("opacity", 2e-6), ("moment", 1e-4)):
-        pair = [np.array(getattr(item, name)) for item in (found, expected)]
+        pair = [np.array(getattr(item, name)) for item in (actual, expected)]
         np.testing.assert_allclose(*pair, atol=atol, err_msg=name)
 
 
@@ -70,8 +70,8 @@ def test_octants_skipped_in_the_bundled_scene_are_hardly_seen():
     for occupancy in (field.occupancy, Occupancy(field.occupancy.cells)):
         field.occupancy = occupancy
         posed, views = PosedField(field), [road_rays(x) for x in (-30.0, -10.0, 10.0)]
-        seen = [PackedMarch(posed, STOP).march(rays).radiance for rays in views]
-        colours.append(linear_to_srgb_numpy(np.stack([x.numpy() for x in seen])))
+        radiances = [PackedMarch(posed, STOP).march(rays).radiance for rays in views]
+        colours.append(linear_to_srgb_numpy(np.stack([x.numpy() for x in radiances])))
         counts.append(np.mean([sample_count(posed, rays).numpy() for rays in views]))
     psnr = -10 * np.log10(np.mean((colours[0] - colours[1]) ** 2))
     assert 45 < psnr < 70
@@ -109,8 +109,10 @@ def test_empty_field_and_opaque_first_cell(rng):
     field = small_ngp()
     field.occupy(Occupancy(np.zeros((2, 2, 2), bool)))
     rays = random_rays(rng)
-    seen = PackedMarch(PosedField(field), STOP).march(rays)
-    assert not np.array(seen.opacity).any() and not np.array(seen.radiance).any()
+    integrals = PackedMarch(PosedField(field), STOP).march(rays)
+    assert (
+        not np.array(integrals.opacity).any() and not np.array(integrals.radiance).any()
+    )
     field = small_ngp()
     field.density_scale = 1e9
     assert_same(PosedField(field), rays)
@@ -134,15 +136,20 @@ def test_changed_parameters_are_followed(rng):
     scene = PackedMarch(posed, STOP)
     table = field.encoding.data.numpy().astype(np.float16).astype(np.float32)
     weights = field.parameters()["colour_weights"].numpy().astype(np.float32)
-    seen = []
+    radiances = []
     for by_table, by_weight in ((1.0, 1.0), (0.7, 1.0), (0.5, -2.0), (1.0, 1.0)):
         field.set_parameter("table", mi.Float(np.float32(by_table) * table))
         field.set_parameter("colour_weights", mi.Float(np.float32(by_weight) * weights))
-        found, expected = scene.march(rays), march(posed, rays)
-        seen.append(np.array(found.radiance))
-        np.testing.assert_allclose(seen[-1], np.array(expected.radiance), atol=2e-5)
-    np.testing.assert_array_equal(seen[0], seen[3])
-    assert all(np.abs(x - y).max() > 0.01 for x, y in zip(seen, seen[1:], strict=False))
+        actual, expected = scene.march(rays), march(posed, rays)
+        radiances.append(np.array(actual.radiance))
+        np.testing.assert_allclose(
+            radiances[-1], np.array(expected.radiance), atol=2e-5
+        )
+    np.testing.assert_array_equal(radiances[0], radiances[3])
+    assert all(
+        np.abs(x - y).max() > 0.01
+        for x, y in zip(radiances, radiances[1:], strict=False)
+    )
 
 
 def test_nothing_is_compiled_for_other_rays():
@@ -186,5 +193,5 @@ def test_the_choice_is_by_field(rng):
     chosen = scene_march(posed, STOP)
     assert isinstance(chosen, FieldMarch)
     expected = np.array(march(posed, rays).radiance)
-    found = np.array(chosen.march(rays).radiance)
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    radiance = np.array(chosen.march(rays).radiance)
+    np.testing.assert_allclose(radiance, expected, atol=1e-6)

@@ -22,5 +22,5 @@ def test_cells_hold_few_rays_whatever_the_shape_of_the_picture() -> None:
     y, z = np.meshgrid(np.linspace(-0.4, 0.4, 400), np.linspace(-0.1, 0.1, 100))
     rays = np.stack([0 * y + 1, y, z]).reshape(3, -1)
     rays /= np.linalg.norm(rays, axis=0)
-    found = sort_rays(mi.Point3f(0), mi.Vector3f(rays.astype(np.float32)))
-    assert rays.shape[1] / found.cells == pytest.approx(PER_CELL, rel=0.1)
+    sorted_rays = sort_rays(mi.Point3f(0), mi.Vector3f(rays.astype(np.float32)))
+    assert rays.shape[1] / sorted_rays.cells == pytest.approx(PER_CELL, rel=0.1)

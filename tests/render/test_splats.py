@@ -70,14 +70,14 @@ def test_one_gaussian_has_the_closed_form(distance: float) -> None:
     )  # its second axis points along z, its third along -y
     y, z = np.meshgrid(np.linspace(-0.59, 0.59, 9), np.linspace(-0.29, 0.29, 9))
     origins = np.stack([0 * y, y, z], -1).reshape(-1, 3)
-    seen = look(item, origins)
+    integrals = look(item, origins)
     squared = (origins[:, 1] / 0.2) ** 2 + (origins[:, 2] / 0.1) ** 2
     opacity = np.where(squared <= 9, 0.7 * np.exp(-squared / 2), 0)
-    np.testing.assert_allclose(seen.opacity.numpy(), opacity, atol=2e-6)
+    np.testing.assert_allclose(integrals.opacity.numpy(), opacity, atol=2e-6)
     expected = opacity[:, None] * srgb_to_linear_numpy(RED)
-    np.testing.assert_allclose(seen.radiance.numpy().T, expected, atol=2e-6)
+    np.testing.assert_allclose(integrals.radiance.numpy().T, expected, atol=2e-6)
     depth = np.where(opacity > 0, distance, np.inf)
-    np.testing.assert_allclose(seen.depth.numpy(), depth, rtol=1e-5)
+    np.testing.assert_allclose(integrals.depth.numpy(), depth, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -86,12 +86,14 @@ def test_one_gaussian_has_the_closed_form(distance: float) -> None:
 @pytest.mark.parametrize("order", [1, -1])
 def test_two_along_a_ray_blend_in_srgb_front_to_back(far, size, order: int) -> None:
     rows = [([2.0, 0, 0], RED, 0.6, 0.1), ([far, 0, 0], BLUE, 0.3, size)][::order]
-    seen = look(made.splats(*map(list, zip(*rows, strict=True))))
+    integrals = look(made.splats(*map(list, zip(*rows, strict=True))))
     first, second = 0.6, 0.4 * 0.3
-    assert float(seen.opacity[0]) == pytest.approx(first + second, rel=1e-5)
-    assert float(seen.moment[0]) == pytest.approx(2 * first + far * second, rel=1e-5)
+    assert float(integrals.opacity[0]) == pytest.approx(first + second, rel=1e-5)
+    assert float(integrals.moment[0]) == pytest.approx(
+        2 * first + far * second, rel=1e-5
+    )
     expected = linear(first * RED + second * BLUE, np.array(first + second))
-    np.testing.assert_allclose(seen.radiance.numpy()[:, 0], expected, rtol=1e-5)
+    np.testing.assert_allclose(integrals.radiance.numpy()[:, 0], expected, rtol=1e-5)
 
 
 def sphere(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -107,11 +109,11 @@ def test_a_cloud_is_its_float64_sum(rng, giants: int, t_max: float) -> None:
     # among the splats, so that many contain the origin
     display, opacity, moment = made.reference(item, origin, directions, t_max)
     assert (opacity > 0.5).any()
-    seen = look(item, origin, directions, t_max)
-    np.testing.assert_allclose(seen.opacity.numpy(), opacity, atol=1e-5)
-    np.testing.assert_allclose(seen.moment.numpy(), moment, atol=1e-4)
+    integrals = look(item, origin, directions, t_max)
+    np.testing.assert_allclose(integrals.opacity.numpy(), opacity, atol=1e-5)
+    np.testing.assert_allclose(integrals.moment.numpy(), moment, atol=1e-4)
     expected = linear(display, opacity)
-    np.testing.assert_allclose(seen.radiance.numpy().T, expected, atol=1e-5)
+    np.testing.assert_allclose(integrals.radiance.numpy().T, expected, atol=1e-5)
 
 
 def test_small_and_thin_splats_far_away_are_not_missed(rng) -> None:
@@ -123,12 +125,12 @@ def test_small_and_thin_splats_far_away_are_not_missed(rng) -> None:
     directions = (aims / np.linalg.norm(aims, axis=1)[:, None]).astype(np.float32)
     _, opacity, moment = made.reference(item, np.zeros(3), directions)
     assert np.median(opacity) > 0.5
-    seen = look(item, directions=directions)
-    for found, expected, scale in (
-        (seen.opacity, opacity, 1),
-        (seen.moment, moment, 20),
+    integrals = look(item, directions=directions)
+    for actual, expected, scale in (
+        (integrals.opacity, opacity, 1),
+        (integrals.moment, moment, 20),
     ):
-        error = np.abs(found.numpy() - expected) / scale
+        error = np.abs(actual.numpy() - expected) / scale
         assert np.quantile(error, 0.97) < 1e-4  # now and then two are entered as one
         assert error.max() < 0.02
 
@@ -140,12 +142,12 @@ def test_rays_may_come_from_many_origins(rng, count: int, each: int) -> None:
     origins = rng.uniform(-0.4, 0.4, (count, 3)).astype(np.float32) + [-6, 0, 0]
     aims = np.array([3, 0, 0]) + rng.normal(0, 0.4, (count, each, 3))
     aims = (aims / np.linalg.norm(aims, axis=2)[..., None]).astype(np.float32)
-    seen = look(item, np.repeat(origins, each, 0), aims.reshape(-1, 3))
-    found = seen.opacity.numpy().reshape(count, each), seen.moment.numpy()
+    integrals = look(item, np.repeat(origins, each, 0), aims.reshape(-1, 3))
+    sums = integrals.opacity.numpy().reshape(count, each), integrals.moment.numpy()
     for k, (origin, directions) in enumerate(zip(origins, aims, strict=True)):
         _, opacity, moment = made.reference(item, origin, directions)
-        np.testing.assert_allclose(found[0][k], opacity, atol=1e-5)
-        np.testing.assert_allclose(found[1].reshape(count, each)[k], moment, atol=2e-4)
+        np.testing.assert_allclose(sums[0][k], opacity, atol=1e-5)
+        np.testing.assert_allclose(sums[1].reshape(count, each)[k], moment, atol=2e-4)
 
 
 def test_many_along_a_ray_are_sorted_by_depth(rng) -> None:
@@ -155,20 +157,20 @@ def test_many_along_a_ray_are_sorted_by_depth(rng) -> None:
     # against their order in memory
     ray = np.array([61.0, 0, 0]), np.array([[-1.0, 0, 0]])
     display, opacity, moment = made.reference(item, *ray)
-    seen = look(item, *ray)
-    assert float(seen.opacity[0]) == pytest.approx(opacity[0], rel=1e-4)
-    assert float(seen.moment[0]) == pytest.approx(moment[0], rel=1e-4)
+    integrals = look(item, *ray)
+    assert float(integrals.opacity[0]) == pytest.approx(opacity[0], rel=1e-4)
+    assert float(integrals.moment[0]) == pytest.approx(moment[0], rel=1e-4)
     expected = linear(display, opacity)
-    np.testing.assert_allclose(seen.radiance.numpy().T, expected, rtol=1e-4)
+    np.testing.assert_allclose(integrals.radiance.numpy().T, expected, rtol=1e-4)
 
 
 def test_rays_end_where_little_is_passed_or_nothing_is_met() -> None:
     item = made.splats([[2, 0, 0], [2, 0, 0], [4, 0, 0]], RED, 0.9)
     assert float(look(item, stop=0.05).opacity[0]) == pytest.approx(0.99, rel=1e-5)
     assert float(look(item).opacity[0]) == pytest.approx(0.999, rel=1e-5)
-    seen = look(item, directions=[[-1, 0, 0], [0, 1, 0]])
-    assert not seen.opacity.numpy().any() and not seen.radiance.numpy().any()
-    assert np.isinf(seen.depth.numpy()).all()
+    integrals = look(item, directions=[[-1, 0, 0], [0, 1, 0]])
+    assert not integrals.opacity.numpy().any() and not integrals.radiance.numpy().any()
+    assert np.isinf(integrals.depth.numpy()).all()
     rays = Rays(mi.Point3f(0), mi.Vector3f(1, 0, 0), active=mi.Bool(False))
     assert float(SplatBackground(item).march(rays, 0.0).opacity[0]) == 0
 
@@ -179,8 +181,8 @@ def test_rays_end_where_little_is_passed_or_nothing_is_met() -> None:
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_colour_turns_with_the_view(rng, degree: int) -> None:
     """By the polynomials of degree 1 and of the last harmonic of the others."""
-    rest = np.zeros((1, (degree + 1) ** 2 - 1, 3))
-    rest[0, -1, 1] = 0.3
+    harmonics = np.zeros((1, (degree + 1) ** 2 - 1, 3))
+    harmonics[0, -1, 1] = 0.3
     x, y, z = direction = sphere(rng, 1)[0].astype(float)
     value = {
         1: 0.3 * -x,
@@ -188,12 +190,12 @@ def test_colour_turns_with_the_view(rng, degree: int) -> None:
         3: 0.3 * -np.sqrt(35 / (32 * np.pi)) * x * (x * x - 3 * y * y),
     }[degree]
     if degree == 1:
-        rest[0, :2, 1] = 0.1, 0.2
+        harmonics[0, :2, 1] = 0.1, 0.2
         value = np.sqrt(3 / (4 * np.pi)) * (value - 0.1 * y + 0.2 * z)
-    item = made.splats([0, 0, 0], (0.5, 0.4, 0.3), 0.5, rest=rest)
-    seen = look(item, -2 * direction, direction)
+    item = made.splats([0, 0, 0], (0.5, 0.4, 0.3), 0.5, bands=harmonics)
+    integrals = look(item, -2 * direction, direction)
     expected = 0.5 * srgb_to_linear_numpy(np.array([0.5, 0.4 + value, 0.3]))
-    np.testing.assert_allclose(seen.radiance.numpy()[:, 0], expected, rtol=1e-5)
+    np.testing.assert_allclose(integrals.radiance.numpy()[:, 0], expected, rtol=1e-5)
 
 
 def test_a_pose_moves_splats_with_their_views(rng) -> None:
@@ -222,16 +224,16 @@ def test_a_splat_hides_and_is_hidden_by_depth(x: float) -> None:
     rays = Rays(mi.Point3f(0, 0, 0), mi.Vector3f(1, 0, 0))
     dr.make_opaque(rays)
     layers = [SplatBackground(made.splats([x, 0, 0], RED, 0.6)), cube]
-    seen = DepthComposite().render(layers, rays, 0.0)
+    primal = DepthComposite().render(layers, rays, 0.0)
     splat = 0.6, srgb_to_linear_numpy(RED), x
     grey = np.full(3, small.sigmoid_to_linear(np.array(0.3)))
-    slab = 1 - np.exp(-1.4), grey, float(seen.layers[1].depth[0])
+    slab = 1 - np.exp(-1.4), grey, float(primal.layers[1].depth[0])
     (a, front, near), (b, back, far) = (splat, slab) if x < 5 else (slab, splat)
     expected = a * front + (1 - a) * b * back
-    np.testing.assert_allclose(seen.total.radiance.numpy()[:, 0], expected, rtol=2e-4)
-    assert float(seen.total.opacity[0]) == pytest.approx(a + (1 - a) * b, rel=2e-4)
+    np.testing.assert_allclose(primal.total.radiance.numpy()[:, 0], expected, rtol=2e-4)
+    assert float(primal.total.opacity[0]) == pytest.approx(a + (1 - a) * b, rel=2e-4)
     moment = a * near + (1 - a) * b * far
-    assert float(seen.total.moment[0]) == pytest.approx(moment, rel=2e-4)
+    assert float(primal.total.moment[0]) == pytest.approx(moment, rel=2e-4)
 
 
 # Derivatives
@@ -248,13 +250,13 @@ class Derived:
         self.rays = Rays(mi.Point3f(self.origin), mi.Vector3f(self.directions.T))
         self.cotangent = small.random_march(rng, n)
         self.splats = SplatBackground(self.item)
-        self.seen = self.splats.march(self.rays, 0.0)
+        self.primal = self.splats.march(self.rays, 0.0)
         self.values = {"harmonics": self.splats.harmonics, "opacity": None}
         self.values["opacity"] = self.splats.opacity
         dr.enable_grad(self.splats.harmonics, self.splats.opacity)
 
     def derive(self, mode: dr.ADMode, cotangent: March) -> Any:
-        args = self.rays, self.seen, cotangent, 0.0, mode == dr.ADMode.Backward
+        args = self.rays, self.primal, cotangent, 0.0, mode == dr.ADMode.Backward
         return self.splats.derivative(mode, *args)
 
     def expected(self, origin=0.0, directions=0.0, **changes: Any) -> np.ndarray:
@@ -276,8 +278,8 @@ def derived(rng) -> Derived:
     return Derived(rng)
 
 
-def agree(found: np.ndarray, expected: np.ndarray) -> None:
-    assert np.linalg.norm(found - expected) < 1e-4 * np.linalg.norm(expected)
+def agree(actual: np.ndarray, expected: np.ndarray) -> None:
+    assert np.linalg.norm(actual - expected) < 1e-4 * np.linalg.norm(expected)
 
 
 STEP = 1e-6  # of differences in float64
@@ -286,7 +288,7 @@ STEP = 1e-6  # of differences in float64
 @pytest.mark.parametrize("name", ["harmonics", "opacity"])
 def test_derivatives_by_shades_are_those_of_the_float64_sum(derived, name) -> None:
     derived.derive(dr.ADMode.Backward, derived.cotangent)
-    found = dr.grad(derived.values[name]).numpy()
+    gradient = dr.grad(derived.values[name]).numpy()
     key = {"opacity": "opacities"}.get(name, name)
     values = getattr(derived.item, key).astype(float)
     expected = []
@@ -297,18 +299,18 @@ def test_derivatives_by_shades_are_those_of_the_float64_sum(derived, name) -> No
             changed.flat[k] += step
             pair.append(derived.expected(**{key: changed}).sum())
         expected.append((pair[0] - pair[1]) / (2 * STEP))
-    agree(found, np.array(expected))
+    agree(gradient, np.array(expected))
 
 
 @pytest.mark.parametrize("name", ["origin", "direction"])
 def test_derivatives_by_rays_are_those_of_the_float64_sum(derived, name) -> None:
     _, by_rays = derived.derive(dr.ADMode.Backward, derived.cotangent)
-    found = getattr(by_rays, name).numpy()
+    gradient = getattr(by_rays, name).numpy()
     key = {"direction": "directions"}.get(name, name)
     for axis in range(3):
         step = STEP * np.eye(3)[axis]
         pair = [derived.expected(**{key: sign * step}) for sign in (1, -1)]
-        agree(found[axis], (pair[0] - pair[1]) / (2 * STEP))
+        agree(gradient[axis], (pair[0] - pair[1]) / (2 * STEP))
 
 
 def test_derivatives_by_rays_are_0_unless_asked_for(derived) -> None:
@@ -329,9 +331,9 @@ def test_tangents_are_the_transpose(derived, rng) -> None:
 
 
 def test_colours_that_change_with_the_view_move_with_the_origin(rng) -> None:
-    rest = rng.normal(0, 0.2, (4, 3, 3))
+    harmonics = rng.normal(0, 0.2, (4, 3, 3))
     centers = [[8, 0.3, 0.1], [10, -0.2, 0.2], [12, 0, -0.3], [14, 0.1, 0]]
-    item = SplatBackground(made.splats(centers, 0.5, 0.5, 3.0, rest=rest))
+    item = SplatBackground(made.splats(centers, 0.5, 0.5, 3.0, bands=harmonics))
     aims = [[10, y, z] for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
     directions = np.array(aims) / np.linalg.norm(aims, axis=1)[:, None]
     cotangent = small.random_march(rng, 4)
@@ -339,14 +341,14 @@ def test_colours_that_change_with_the_view_move_with_the_origin(rng) -> None:
     def rays(x: np.ndarray) -> Rays:
         return Rays(mi.Point3f(x), mi.Vector3f(directions.T.astype(np.float32)))
 
-    seen = item.march(rays(np.zeros(3)), 0.0)
-    args = rays(np.zeros(3)), seen, cotangent, 0.0, True
-    _, found = item.derivative(dr.ADMode.Backward, *args)
+    primal = item.march(rays(np.zeros(3)), 0.0)
+    args = rays(np.zeros(3)), primal, cotangent, 0.0, True
+    _, by_rays = item.derivative(dr.ADMode.Backward, *args)
     for axis in range(3):
         step = 0.02 * np.eye(3)[axis]
         pair = [item.march(rays(sign * step), 0.0) for sign in (1, -1)]
         expected = small.pairing(pair[0], cotangent) - small.pairing(pair[1], cotangent)
-        by_origin = float(dr.sum(found.origin[axis])[0])
+        by_origin = float(dr.sum(by_rays.origin[axis])[0])
         assert by_origin == pytest.approx(25 * expected, rel=5e-3, abs=1e-3)
 
 
@@ -375,10 +377,10 @@ def test_a_gradient_goes_through_a_camera_among_splats(loop) -> None:
     """Steering turns what the next frame shows, splats too; held cameras miss that."""
     (posed,) = loop.sensor.objects
     rollout = make_rollout(loop, 10, attached=True)
-    found = texture_gradient(rollout)
-    direction = unit(found)
+    gradient = texture_gradient(rollout)
+    direction = unit(gradient)
     expected = central_difference(along_texture(rollout, posed.field, direction), 0.2)
-    assert float((found * direction).sum()) == pytest.approx(expected, rel=0.01)
+    assert float((gradient * direction).sum()) == pytest.approx(expected, rel=0.01)
     held = texture_gradient(make_rollout(loop, 10))
     assert float((held * direction).sum()) != pytest.approx(expected, rel=0.03)
 
@@ -386,11 +388,11 @@ def test_a_gradient_goes_through_a_camera_among_splats(loop) -> None:
 def test_splats_are_not_interleaved(loop) -> None:
     sensor, composite = loop.sensor, InterleavedComposite()
     rays = Rays(mi.Point3f(0, 0, 0), mi.Vector3f(1, 0, 0))
-    parts = sensor.layers[:1], sensor.objects, sensor.intrinsics
+    arguments = sensor.layers[:1], sensor.objects, sensor.intrinsics
     for call in (
         lambda: composite.check(sensor.layers),
         lambda: composite.render(sensor.layers, rays, 0.0),
-        lambda: field_sensor(*parts, composite="interleaved"),
+        lambda: field_sensor(*arguments, composite="interleaved"),
     ):
         with pytest.raises(InputError, match="set composite to depth"):
             call()

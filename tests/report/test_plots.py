@@ -35,8 +35,8 @@ SQUARE = np.array([[9, -3], [10, -3], [10, -2], [9, -2]])
 
 def holds(axis, data) -> bool:
     """Whether a line of an axis goes through points (n, 2) and no others."""
-    found = [np.asarray(line.get_xydata()) for line in axis.lines]
-    return any(f.shape == data.shape and np.allclose(f, data) for f in found)
+    polylines = [np.asarray(line.get_xydata()) for line in axis.lines]
+    return any(f.shape == data.shape and np.allclose(f, data) for f in polylines)
 
 
 def test_iterations_and_the_best_so_far_are_drawn(monkeypatch):
@@ -45,8 +45,8 @@ def test_iterations_and_the_best_so_far_are_drawn(monkeypatch):
     curve = {"frames": [10, 35, 60, 85, 110, 135], "cross_track_mean_m": means}
     curve["objective"] = [0.0, -1.0, -2.0, -3.0, -4.0, -4.0]
     figures = drawn(monkeypatch)
-    for given in (None, curve):
-        convergence("convergence.png", history, given)
+    for optional_curve in (None, curve):
+        convergence("convergence.png", history, optional_curve)
     by_iteration, by_frames = figures
     for index, name in enumerate(("objective", "cross_track_mean_m")):
         values, first = [x[name] for x in history], by_iteration.axes[index]
@@ -90,7 +90,7 @@ def test_maps_and_errors_show_drives_and_objects(monkeypatch):
         out = drives[0].states[1:][drives[0].departed(0.85), :2]
         assert 0 < len(out) < 40 and holds(axis, out)
         corners = [patch.get_xy()[:4] for patch in axis.patches]
-        assert any(np.array_equal(found, SQUARE) for found in corners)
+        assert any(np.array_equal(corner_set, SQUARE) for corner_set in corners)
     for axis in figures[1].axes:
         times, distances = drives[0].time_s, np.abs(drives[0].cross_track_m)
         assert holds(axis, np.stack([times, distances], 1))
@@ -162,8 +162,8 @@ def test_tiles_stand_row_by_row_under_their_titles():
     sheet = strip.tiles(images)
     scale = strip.TILE_PX // 100
     assert scale == 4 and sheet.shape[1] == 2 * (400 + strip.GAP_PX) + strip.GAP_PX
-    found = [int(v) for v in sheet[:, strip.GAP_PX + 399, 0] if v in colours.values()]
-    assert found == [10] * 20 + [170] * 20
+    values = [int(v) for v in sheet[:, strip.GAP_PX + 399, 0] if v in colours.values()]
+    assert values == [10] * 20 + [170] * 20
     right = sheet[:, 2 * strip.GAP_PX + 400 :, 0]
     assert (right == 90).sum() >= 20 * 400
     large = strip.tiles({"one": np.zeros((5, 900, 3), np.uint8)}, 1)
@@ -191,8 +191,8 @@ def test_steps_hold_all_rows_of_the_state(tmp_path):
     write_steps(tmp_path / "steps.csv", drives, LANES)
     table = read_csv(tmp_path / "steps.csv", STEPS, FURTHER)
     assert list(table.columns[len(STEPS) :]) == ["state_3", "state_4"]
-    more = table[["state_3", "state_4"]].to_numpy()
-    np.testing.assert_array_equal(more, [[np.nan] * 2, [np.nan] * 2, [8, 9]])
+    extra_states = table[["state_3", "state_4"]].to_numpy()
+    np.testing.assert_array_equal(extra_states, [[np.nan] * 2, [np.nan] * 2, [8, 9]])
     with refused_at(str(tmp_path / "steps.csv")):
         read_csv(tmp_path / "steps.csv", STEPS)
 
@@ -202,8 +202,8 @@ def test_a_table_has_a_record_for_each_case():
     drives = [make_drive([0.1], where, case) for where, case in names]
     figures = metrics.summarise(drives, LANES)
     records = metrics_table({"routes": figures}).records
-    found = [(row["environment"], row["case"]) for row in records]
-    assert sorted(found) == sorted(names)
+    pairs = [(row["environment"], row["case"]) for row in records]
+    assert sorted(pairs) == sorted(names)
 
 
 def test_charts_are_vectors_too_where_the_variable_asks(tmp_path, monkeypatch):

@@ -58,15 +58,19 @@ def test_one_frame(world: World) -> None:
         return (np.array(image, np.float64) * weight).sum((1, 2, 3))
 
     state = loop.initial(poses)
-    seen = sensor.observe(state, 0)
+    observation = sensor.observe(state, 0)
     sensor.start_gradient()
     d_image = mi.TensorXf(np.repeat(weight[None], len(poses), 0))
-    found = np.array(sensor.vjp(seen, state, d_image, True)).reshape(-1, len(poses)).T
+    gradient = (
+        np.array(sensor.vjp(observation, state, d_image, True))
+        .reshape(-1, len(poses))
+        .T
+    )
     for name, direction in (
         ("heading", np.repeat(HEADING[None], len(poses), 0)),
         ("lateral", np.array([to_the_left(pose) for pose in poses])),
     ):
-        by_pose = (found[:, :3] * direction).sum(1)
+        by_pose = (gradient[:, :3] * direction).sum(1)
         # the slope of many small differences: single precision rounds points to a
         # twentieth of what one of them moves, and larger ones bend
         steps = np.arange(1, 17) / 16 * (5e-6 if name == "heading" else 1e-4)

@@ -84,11 +84,11 @@ def test_attached_gradient_is_that_of_the_whole_loop(vehicle, delay, memory, rng
     loop = make_loop(VEHICLES[vehicle], delay, memory)
     rollout, poses = Rollout(loop, Wave(), 8, attached=True), analytic.random_poses(2)
     start = loop.dynamics.extend(poses)
-    found = rollout.gradient(rollout.run(to_state(start)))
+    derivative = rollout.gradient(rollout.run(to_state(start)))
     (base,) = [texture.numpy().copy() for texture in loop.sensor.textures()]
     direction, along = rng.normal(size=base.shape), rng.normal(size=start.shape)
-    expected = (found.textures[0].numpy() * direction).sum()
-    expected += (np.array(found.initial).T * along).sum()
+    expected = (derivative.textures[0].numpy() * direction).sum()
+    expected += (np.array(derivative.initial).T * along).sum()
 
     def value(s):
         loop.sensor.set_textures([base + s * direction])
@@ -117,13 +117,13 @@ def test_a_path_is_followed_by_steering_and_acceleration(rng):
     rollout = Rollout(loop, Wave(), 6, attached=True)
     evaluation = rollout.run(to_state(start))
     assert evaluation.trajectory.controls_numpy().shape == (2, 6, 2)
-    found = np.array(rollout.gradient(evaluation).initial).T
+    by_start = np.array(rollout.gradient(evaluation).initial).T
     along = rng.normal(size=start.shape)
 
     def value(s):
         return rollout.run(to_state(start + s * along)).value
 
-    expected = (found * along).sum()
+    expected = (by_start * along).sum()
     assert central_difference(value, 1e-4) == pytest.approx(expected, rel=1e-5)
 
 
@@ -145,10 +145,10 @@ def test_the_three_ways_back_agree(attached, memory):
 def test_a_batch_is_its_drives_one_by_one(vehicle):
     loop, poses = make_loop(VEHICLES[vehicle], delay=2), analytic.random_poses(3)
     rollout = Rollout(loop, Wave(), 6, attached=True)
-    whole = rollout.run(loop.initial(poses))
-    controls = whole.trajectory.controls_numpy()
+    batch = rollout.run(loop.initial(poses))
+    controls = batch.trajectory.controls_numpy()
     assert controls.shape == (3, 6, 2)
-    derivative = rollout.gradient(whole)
+    derivative = rollout.gradient(batch)
     texture = np.zeros_like(derivative.textures[0].numpy())
     for number, pose in enumerate(poses):
         alone = replace(rollout, loop=loop.numbered(number))
@@ -188,20 +188,23 @@ def torch_car(state, control):
 
 def test_functions_of_the_user_take_two_controls():
     """In Dr.Jit and in torch: equal drives and gradients."""
-    about = {"size": 4, "limit": (0.6, 3.0), "rest": (4.0,), "controls": 2}
-    poses, found = analytic.random_poses(2), []
-    for car in (FunctionDynamics(user_car, **about), TorchDynamics(torch_car, **about)):
+    options = {"size": 4, "limit": (0.6, 3.0), "rest_state": (4.0,), "controls": 2}
+    poses, arrays = analytic.random_poses(2), []
+    for car in (
+        FunctionDynamics(user_car, **options),
+        TorchDynamics(torch_car, **options),
+    ):
         assert car.control_names == ("control_0", "control_1")
         rollout = Rollout(make_loop(car, delay=1), Wave(), 5, attached=True)
         evaluation = rollout.run(rollout.loop.initial(poses))
-        found.append([evaluation.trajectory.states_numpy()])
-        found[-1] += flat(rollout.gradient(evaluation))
-    assert_close(found[1], found[0], 1e-9)
+        arrays.append([evaluation.trajectory.states_numpy()])
+        arrays[-1] += flat(rollout.gradient(evaluation))
+    assert_close(arrays[1], arrays[0], 1e-9)
 
 
-def drive_with(vehicle, module, **more):
+def drive_with(vehicle, module, **options):
     def call():
-        loop = replace(make_loop(vehicle), policy=TorchPolicy(module, **more))
+        loop = replace(make_loop(vehicle), policy=TorchPolicy(module, **options))
         Rollout(loop, Wave(), 2).run(loop.initial(np.zeros((1, 3))))
 
     return call

@@ -53,12 +53,12 @@ def test_derivatives_by_images_are_autograd(attached):
     value = wave_in_torch(states, twin.dt).mean()
     for steps in ({1, 3}, set(range(6)), set()):
         rendered = loop.sensor.renders
-        found = rollout.by_images(drive, steps)
-        assert set(found) == steps
+        by_step = rollout.by_images(drive, steps)
+        assert set(by_step) == steps
         first = min(steps, default=6)
-        seen = 6 - first if attached else len(steps)
-        assert loop.sensor.renders - rendered == 2 * seen
-        for step, by_image in found.items():
+        periods = 6 - first if attached else len(steps)
+        assert loop.sensor.renders - rendered == 2 * periods
+        for step, by_image in by_step.items():
             image = twin.images[step]
             (expected,) = torch.autograd.grad(
                 value, image, retain_graph=True, allow_unused=True
@@ -83,14 +83,14 @@ def test_derivatives_by_images_go_through_a_memory():
 
         def value(s, step=step, direction=direction):
             def nudged(state, index):
-                seen = observe(state, index)
+                observation = observe(state, index)
                 change = analytic.tensor(s * direction * (index == step))
-                return replace(seen, image=seen.image + change)
+                return replace(observation, image=observation.image + change)
 
             loop.sensor.observe = nudged
-            found = rollout.run(initial).value
+            cost = rollout.run(initial).value
             loop.sensor.observe = observe
-            return found
+            return cost
 
         expected = central_difference(value, 1e-5)
         assert (by_image * direction).sum() == pytest.approx(expected, rel=1e-6)
@@ -104,8 +104,10 @@ class StackPolicy(torch.nn.Module):
         self.network = analytic.AnalyticPolicy()
 
     def forward(self, image, goal):
-        parts = image.split(3, dim=1)
-        return sum(w * self.network(x, goal) for w, x in zip(GAINS, parts, strict=True))
+        images = image.split(3, dim=1)
+        return sum(
+            w * self.network(x, goal) for w, x in zip(GAINS, images, strict=True)
+        )
 
 
 def check(loop, twin, initial, horizon, reduce=torch.mean, tolerance=1e-8, **options):
@@ -147,10 +149,16 @@ def test_each_drive_has_its_own_delay(substeps, delay, attached, name):
     """Also of a part of a step, and of several control periods."""
     loop, twin = analytic.make_pair("ackermann", "rk4", substeps, delay)
     variation = Variation(delay_s_sd=0.2, seed=8)
-    more = variation.draws(0, 3).delay_s / loop.transition.dt
-    assert more.min() < substeps < more.max() / 2 and (more % 1).min() > 0.1
+    extra_steps = variation.draws(0, 3).delay_s / loop.transition.dt
+    assert (
+        extra_steps.min() < substeps < extra_steps.max() / 2
+        and (extra_steps % 1).min() > 0.1
+    )
     vehicle = Varied(loop.dynamics, variation, loop.transition.dt)
-    loop, twin.delay = replace(loop, dynamics=vehicle), delay + torch.tensor(more)
+    loop, twin.delay = (
+        replace(loop, dynamics=vehicle),
+        delay + torch.tensor(extra_steps),
+    )
     initial = loop.dynamics.extend(analytic.random_poses(3))
     check(loop, twin, initial, 8, adjoint=ADJOINTS[name], attached=attached)
 
@@ -185,9 +193,9 @@ def test_disturbed_drives_are_differentiated_as_they_were(name, rng):
     initial = analytic.random_poses(3)
     (base,), along = analytic.random_textures(), rng.normal(size=initial.shape)
     direction = rng.normal(size=base.shape)
-    found = rollout.gradient(rollout.run(to_state(initial)))
-    expected = (found.textures[0].numpy() * direction).sum()
-    expected += (np.array(found.initial).T * along).sum()
+    gradient = rollout.gradient(rollout.run(to_state(initial)))
+    expected = (gradient.textures[0].numpy() * direction).sum()
+    expected += (np.array(gradient.initial).T * along).sum()
 
     def value(s):
         loop.sensor.set_textures([base + s * direction])
@@ -214,12 +222,12 @@ def test_costates_are_minus_the_derivative_by_the_states():
     loop, twin = analytic.make_pair("ackermann_rate", "rk4", 2, 1)
     initial = loop.initial(analytic.random_poses(2))
     rollout = Rollout(loop, Wave(), 6, attached=True)
-    found = rollout.gradient(rollout.run(initial)).costates
+    costates = rollout.gradient(rollout.run(initial)).costates
     textures = [torch.tensor(texture.numpy()) for texture in loop.sensor.textures()]
     start = torch.tensor(np.array(initial).T, requires_grad=True)
     states, _ = twin.drive(start, textures, 6, True)
     by_states = torch.autograd.grad(wave_in_torch(states, twin.dt).mean(), twin.states)
-    assert_close(found, [-value.numpy() for value in by_states[1:]])
+    assert_close(costates, [-value.numpy() for value in by_states[1:]])
 
 
 def test_the_worst_drive_alone_is_differentiated():
@@ -241,9 +249,9 @@ def test_dr_backward_differentiates_the_function(rng):
     loop.sensor.set_textures([0 * t for t in dr.detach(textures)])  # another's use
     loop.sensor.set_parameters({"offsets": OFFSETS})
     dr.backward(3 * value)
-    found = [dr.grad(texture).numpy() for texture in textures]
-    found += [np.array(dr.grad(start)).T, dr.grad(offsets).numpy()]
-    assert_close([value / 3 for value in found], expected)
+    gradients = [dr.grad(texture).numpy() for texture in textures]
+    gradients += [np.array(dr.grad(start)).T, dr.grad(offsets).numpy()]
+    assert_close([value / 3 for value in gradients], expected)
 
 
 def named(textures, offsets):
@@ -265,10 +273,10 @@ def test_torch_differentiates_the_function():
     values = [t.numpy() for t in loop.sensor.textures()] + [initial, OFFSETS]
     leaves = [torch.tensor(value, requires_grad=True) for value in values]
     *textures, start, offsets = leaves
-    found = function(textures, start.T, offsets)
-    assert found.item() == pytest.approx(value, rel=1e-12)
+    cost = function(textures, start.T, offsets)
+    assert cost.item() == pytest.approx(value, rel=1e-12)
     loop.sensor.set_parameters({"offsets": 0 * OFFSETS})  # another's use
-    (2 * found).backward()
+    (2 * cost).backward()
     assert_close([leaf.grad.numpy() / 2 for leaf in leaves], expected)
 
 
@@ -277,20 +285,22 @@ def test_the_gradient_comes_apart_by_periods(rng):
     initial = to_state(analytic.random_poses(2))
     rollout = Rollout(loop, Wave(), 6)
     directions = [rng.normal(size=t.shape) for t in loop.sensor.textures()]
-    found = rollout.gradient(rollout.run(initial), recorder=StepRecorder(directions))
-    parts = found.attribution
-    assert parts.norms.shape == parts.along.shape == (6, 2)
-    assert (parts.norms > 0).all()
+    derivative = rollout.gradient(
+        rollout.run(initial), recorder=StepRecorder(directions)
+    )
+    attribution = derivative.attribution
+    assert attribution.norms.shape == attribution.along.shape == (6, 2)
+    assert (attribution.norms > 0).all()
     periods = {}
     recorder = StepRecorder(on_period=periods.__setitem__)
     rollout.gradient(rollout.run(initial), recorder=recorder)
     for index, rows in periods.items():
         norms = [np.linalg.norm(row) for row in rows]
-        np.testing.assert_allclose(norms, parts.norms[index], rtol=1e-6)
+        np.testing.assert_allclose(norms, attribution.norms[index], rtol=1e-6)
     assert sorted(periods) == list(range(6))
-    pairs = zip(found.textures, directions, strict=True)
-    whole = [(gradient.numpy() * direction).sum() for gradient, direction in pairs]
-    np.testing.assert_allclose(parts.along.sum(0), whole, rtol=1e-5)
+    pairs = zip(derivative.textures, directions, strict=True)
+    totals = [(gradient.numpy() * direction).sum() for gradient, direction in pairs]
+    np.testing.assert_allclose(attribution.along.sum(0), totals, rtol=1e-5)
 
 
 def test_what_cannot_be_differentiated_is_refused():

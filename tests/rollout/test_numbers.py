@@ -27,7 +27,7 @@ from mi_nerfattack.vehicle.user_model import FunctionDynamics
 pytestmark = pytest.mark.usefixtures("variant")
 
 ROUTE = Route("bend", 1, np.array([[-3.0, 0], [2, 0], [4, 1], [9, 1.5]]))
-TOLD = Numbers(speed=True, route_m=(2.0, 4.0), time=True)
+NUMBERS = Numbers(speed=True, route_m=(2.0, 4.0), time=True)
 TIMES = 0.4, 0.8, 1.2
 
 
@@ -48,16 +48,17 @@ class Waypoints(torch.nn.Module):
         self.image = torch.nn.Linear(72, 6).double()
 
     def forward(self, image, speed, route, time):
-        seen = torch.tanh(self.image(image.flatten(1))).reshape(-1, 3, 2)
+        features = torch.tanh(self.image(image.flatten(1))).reshape(-1, 3, 2)
         ahead = route[:, :1] * torch.tensor(TIMES)[:, None].to(route)
         return (
-            ahead * (1 + 0.1 * torch.sin(time))[:, None] + 0.2 * speed[:, None] * seen
+            ahead * (1 + 0.1 * torch.sin(time))[:, None]
+            + 0.2 * speed[:, None] * features
         )
 
 
 def make_loop(frames=1):
     loop, _ = analytic.make_pair()
-    inputs = Inputs(("image", "speed", "route", "time"), TOLD)
+    inputs = Inputs(("image", "speed", "route", "time"), NUMBERS)
     follow = Trajectory(TIMES, ("steering",), 2.0, 0.5, 0.3)
     module = Waypoints()
     if frames > 1:
@@ -79,8 +80,8 @@ class Newest(torch.nn.Module):
         super().__init__()
         self.network = network
 
-    def forward(self, image, *told):
-        return self.network(0.7 * image[:, 3:] + 0.3 * image[:, :3], *told)
+    def forward(self, image, *numbers):
+        return self.network(0.7 * image[:, 3:] + 0.3 * image[:, :3], *numbers)
 
 
 def slopes(rollout, initial, gradient):
@@ -95,13 +96,13 @@ def slopes(rollout, initial, gradient):
 
     def by_texture(s):
         sensor.set_textures([analytic.tensor(texture + s * look)])
-        found = rollout.measure(to_state(initial)).value
+        cost = rollout.measure(to_state(initial)).value
         sensor.set_textures([analytic.tensor(texture)])
-        return found
+        return cost
 
     yield central_difference(by_start, 1e-4), (np.array(gradient.initial).T * way).sum()
-    found = (gradient.textures[0].numpy() * look).sum()
-    yield central_difference(by_texture, 1e-4), found
+    derivative = (gradient.textures[0].numpy() * look).sum()
+    yield central_difference(by_texture, 1e-4), derivative
 
 
 @pytest.mark.parametrize("adjoint", ADJOINTS.values(), ids=ADJOINTS)
@@ -111,8 +112,8 @@ def test_attached_derivatives_are_those_of_the_whole_loop(adjoint, frames):
     rollout = Rollout(loop, Wave(), 10, adjoint=adjoint, attached=True)
     initial = loop.dynamics.extend(analytic.random_poses(2))
     gradient = rollout.gradient(rollout.run(to_state(initial)))
-    for difference, found in slopes(rollout, initial, gradient):
-        assert found == pytest.approx(difference, rel=1e-6)
+    for difference, derivative in slopes(rollout, initial, gradient):
+        assert derivative == pytest.approx(difference, rel=1e-6)
 
 
 def test_detached_ones_leave_out_the_image_alone():
@@ -122,11 +123,11 @@ def test_detached_ones_leave_out_the_image_alone():
     detached = Rollout(loop, Wave(), 10)
     opened = detached.open_loop(to_state(initial))
     gradient = opened.gradient(opened.run(to_state(initial)))
-    for difference, found in slopes(opened, initial, gradient):
-        assert found == pytest.approx(difference, rel=1e-6)
+    for difference, derivative in slopes(opened, initial, gradient):
+        assert derivative == pytest.approx(difference, rel=1e-6)
     same = detached.gradient(detached.run(to_state(initial)))
-    for found, wanted in zip(flat(same), flat(gradient), strict=True):
-        np.testing.assert_allclose(found, wanted, rtol=1e-9)
+    for actual, expected in zip(flat(same), flat(gradient), strict=True):
+        np.testing.assert_allclose(actual, expected, rtol=1e-9)
 
 
 def test_a_batch_is_its_drives():

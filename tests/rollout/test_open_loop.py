@@ -47,8 +47,8 @@ def test_images_do_not_follow_the_vehicle(closed):
     opened = rollout.open_loop(initial)
     elsewhere = rollout.loop.initial(np.array([[0.0, -0.7, 0.1], [0.0, 0.6, -0.2]]))
     expected = opened.measure(initial).trajectory.controls_numpy()
-    found = opened.measure(elsewhere).trajectory.controls_numpy()
-    np.testing.assert_array_equal(found, expected)
+    controls = opened.measure(elsewhere).trajectory.controls_numpy()
+    np.testing.assert_array_equal(controls, expected)
     closed_ones = rollout.measure(elsewhere).trajectory.controls_numpy()
     assert np.abs(closed_ones - expected).max() > 1e-3
 
@@ -83,10 +83,10 @@ def test_its_gradient_is_its_derivative(closed, frame, adjoint):
     rng = np.random.default_rng(2)
     way = rng.normal(size=texture.shape).astype(np.float32)
     recorder = StepRecorder([way])
-    parts = opened.gradient(opened.run(initial), recorder=recorder).attribution
-    assert np.count_nonzero(parts.along) > 1
+    attribution = opened.gradient(opened.run(initial), recorder=recorder).attribution
+    assert np.count_nonzero(attribution.along) > 1
     total = float((gradient * way).sum())
-    assert parts.along.sum() == pytest.approx(total, rel=1e-4)
+    assert attribution.along.sum() == pytest.approx(total, rel=1e-4)
 
     def value(s):
         rollout.loop.sensor.set_textures([texture + s * way])

@@ -57,8 +57,8 @@ def test_attached_derivatives_are_those_of_the_whole_loop(adjoint, rng):
         return rollout.measure(to_state(initial + s * way)).value
 
     slope = central_difference(by_start, 1e-4)
-    found = (np.array(gradient.initial).T * way).sum()
-    assert found == pytest.approx(slope, rel=1e-6)
+    derivative = (np.array(gradient.initial).T * way).sum()
+    assert derivative == pytest.approx(slope, rel=1e-6)
     (texture,) = (t.numpy().copy() for t in sensor.textures())
     look = rng.normal(size=texture.shape)
 
@@ -67,16 +67,18 @@ def test_attached_derivatives_are_those_of_the_whole_loop(adjoint, rng):
         return rollout.measure(to_state(initial)).value
 
     slope = central_difference(by_texture, 1e-4)
-    found = (gradient.textures[0].numpy() * look).sum()
-    assert found == pytest.approx(slope, rel=1e-6)
+    derivative = (gradient.textures[0].numpy() * look).sum()
+    assert derivative == pytest.approx(slope, rel=1e-6)
 
 
 def test_rounded_images_have_nearly_the_derivative_of_those_that_are_not():
-    found = []
+    gradients = []
     for images in (FLOAT, UINT8):
         rollout = Rollout(make_loop(images), Wave(), PERIODS)
         initial = to_state(analytic.random_poses(1))
         gradient = rollout.gradient(rollout.run(initial))
-        found.append(gradient.textures[0].numpy().ravel())
-    cosine = found[0] @ found[1] / np.prod([np.linalg.norm(x) for x in found])
+        gradients.append(gradient.textures[0].numpy().ravel())
+    cosine = (
+        gradients[0] @ gradients[1] / np.prod([np.linalg.norm(x) for x in gradients])
+    )
     assert 0.98 < cosine < 1 - 1e-12

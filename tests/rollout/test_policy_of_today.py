@@ -68,16 +68,18 @@ def test_detached_gradient_of_ten_periods_with_cameras_held(rng):
     loop, item = make_loop()
     rollout = toy.make_rollout(loop, 10)
     evaluation = rollout.run(loop.initial(toy.INITIAL))
-    found = rollout.gradient(evaluation).textures[0].numpy().astype(float)
+    gradient = rollout.gradient(evaluation).textures[0].numpy().astype(float)
     held = replace(rollout, camera_path=CameraPath(evaluation.trajectory.states))
     base = toy.texture_of(item)
-    direction = toy.unit(toy.unit(found) + 0.5 * toy.unit(rng.normal(size=found.shape)))
+    direction = toy.unit(
+        toy.unit(gradient) + 0.5 * toy.unit(rng.normal(size=gradient.shape))
+    )
 
     def value(s: float) -> float:
         loop.sensor.set_textures([(base + s * direction).astype(np.float32)])
         return toy.objective(held)
 
-    expected = float((found * direction).sum())
+    expected = float((gradient * direction).sum())
     assert central_difference(value, 0.2) == pytest.approx(expected, rel=1e-3)
 
 
@@ -85,7 +87,7 @@ def test_attached_gradient_of_five_periods_of_the_whole_loop():
     loop, item = make_loop(jitter=None)
     rollout = toy.make_rollout(loop, 5, attached=True)
     gradient = toy.gradient(rollout)
-    found = np.array(gradient.initial)[:, 0]
+    by_start = np.array(gradient.initial)[:, 0]
     start = loop.dynamics.extend(toy.INITIAL)
     for axis, step in ((0, 1e-2), (1, 1e-2), (2, 2e-3), (3, 1e-2)):
 
@@ -94,8 +96,8 @@ def test_attached_gradient_of_five_periods_of_the_whole_loop():
             moved[0, axis] += s
             return rollout.run(to_state(moved)).value
 
-        scale = np.abs(found).max()
-        expected = pytest.approx(found[axis], rel=5e-3, abs=5e-3 * scale)
+        scale = np.abs(by_start).max()
+        expected = pytest.approx(by_start[axis], rel=5e-3, abs=5e-3 * scale)
         assert central_difference(value, step) == expected
     by_colour = gradient.textures[0].numpy().astype(float)
     base, direction = toy.texture_of(item), toy.unit(by_colour)

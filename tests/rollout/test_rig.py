@@ -47,13 +47,13 @@ class TwoImages(torch.nn.Module):
         return torch.tanh(((image - 0.4) * self.weight).sum((1, 2, 3)))
 
 
-def make_loop(jitter: int | None = JITTER, **more) -> tuple[ClosedLoop, list]:
+def make_loop(jitter: int | None = JITTER, **changes) -> tuple[ClosedLoop, list]:
     """Return the loop of one camera with a second one, and the objects' fields."""
     one, item = toy.make_loop(jitter_seed=jitter)
     vehicle = Dubins(toy.SPEED, toy.LIMIT)
     policy = TorchPolicy(TwoImages())
     sensor = one.sensor.with_rig(RIG)
-    loop = replace(one, sensor=sensor, policy=policy, dynamics=vehicle, **more)
+    loop = replace(one, sensor=sensor, policy=policy, dynamics=vehicle, **changes)
     return loop, item
 
 
@@ -62,11 +62,11 @@ def test_a_frame_is_the_images_of_cameras_alone():
     state, sensor = loop.initial(POSES), loop.sensor
     frame = sensor.observe(state, 3).image.numpy()
     assert frame.shape == (2, 12, toy.WIDTH + 16, 3)
-    found = RIG.split(frame)
+    images = RIG.split(frame)
     assert not frame[:, toy.HEIGHT :, : toy.WIDTH].any()
     first, _ = toy.make_loop(jitter_seed=JITTER)
     # fields of its own, all alike
-    assert np.array_equal(found["front"], first.sensor.observe(state, 3).image.numpy())
+    assert np.array_equal(images["front"], first.sensor.observe(state, 3).image.numpy())
     alone = field_sensor(
         sensor.layers[0],
         sensor.objects,
@@ -75,10 +75,10 @@ def test_a_frame_is_the_images_of_cameras_alone():
         camera_seed(JITTER, 1),
         0.0,
     )
-    assert np.array_equal(found["left"], alone.observe(state, 3).image.numpy())
+    assert np.array_equal(images["left"], alone.observe(state, 3).image.numpy())
     for index, name in enumerate(RIG.names):
         part = sensor.through(index).observe(state, 3).image.numpy()
-        assert np.array_equal(part, found[name])
+        assert np.array_equal(part, images[name])
     assert sensor.renders == 4  # two frames, and those of the first camera alone
     assert sensor.rig.names == RIG.names and sensor.rig.mounts == RIG.mounts
 
@@ -100,23 +100,25 @@ def test_detached_gradient_holds_the_cameras_paths(adjoint, rng):
     loop, item = make_loop(disturbance=DISTURBANCE)
     rollout = toy.make_rollout(loop, 4, adjoint=adjoint)
     evaluation = rollout.run(loop.initial(POSES))
-    found = rollout.gradient(evaluation).textures[0].numpy().astype(float)
+    gradient = rollout.gradient(evaluation).textures[0].numpy().astype(float)
     held = replace(rollout, camera_path=CameraPath(evaluation.trajectory.states))
     base = toy.texture_of(item)
-    direction = toy.unit(toy.unit(found) + 0.5 * toy.unit(rng.normal(size=found.shape)))
+    direction = toy.unit(
+        toy.unit(gradient) + 0.5 * toy.unit(rng.normal(size=gradient.shape))
+    )
 
     def value(s: float) -> float:
         loop.sensor.set_textures([(base + s * direction).astype(np.float32)])
         return toy.objective(held, POSES)
 
-    expected = float((found * direction).sum())
+    expected = float((gradient * direction).sum())
     assert central_difference(value, 0.2) == pytest.approx(expected, rel=1e-3)
 
 
 def test_attached_gradient_by_the_initial_state():
     loop, _ = make_loop(jitter=None)
     rollout = toy.make_rollout(loop, 5, attached=True)
-    found = np.array(toy.gradient(rollout).initial)[:, 0]
+    by_start = np.array(toy.gradient(rollout).initial)[:, 0]
     # near things cross the left camera's image: a heading's steps are short
     for axis, step in ((0, 4e-2), (1, 4e-2), (2, 4e-3)):
 
@@ -125,16 +127,18 @@ def test_attached_gradient_by_the_initial_state():
             moved[0, axis] += s
             return toy.objective(rollout, moved)
 
-        expected = pytest.approx(found[axis], rel=1e-3, abs=1e-3 * np.abs(found).max())
+        expected = pytest.approx(
+            by_start[axis], rel=1e-3, abs=1e-3 * np.abs(by_start).max()
+        )
         assert central_difference(value, step) == expected
 
 
 def test_the_derivative_by_the_state_is_the_sum_over_cameras(rng):
     sensor, state = make_loop()[0].sensor, make_loop()[0].initial(POSES)
-    seen = sensor.observe(state, 1)
-    d_image = rng.normal(size=seen.image.shape).astype(np.float32)
+    observation = sensor.observe(state, 1)
+    d_image = rng.normal(size=observation.image.shape).astype(np.float32)
     sensor.start_gradient()
-    together = np.array(sensor.vjp(seen, state, mi.TensorXf(d_image), True))
+    together = np.array(sensor.vjp(observation, state, mi.TensorXf(d_image), True))
     total = np.zeros_like(together)
     for index, part in enumerate(RIG.split(d_image).values()):
         alone = sensor.through(index)
@@ -146,15 +150,15 @@ def test_the_derivative_by_the_state_is_the_sum_over_cameras(rng):
 
 def test_adjoints_agree_and_compile_nothing_after_the_first_steps():
     loop, _ = make_loop(disturbance=DISTURBANCE)
-    found = {}
+    gradients = {}
     for adjoint in toy.ADJOINTS:
         toy.gradient(toy.make_rollout(loop, 4, adjoint=adjoint), POSES)
         with nothing_compiled():
             rollout = toy.make_rollout(loop, 4, adjoint=adjoint)
-            found[adjoint] = toy.texture_gradient(rollout, POSES + 0.07)
+            gradients[adjoint] = toy.texture_gradient(rollout, POSES + 0.07)
     for name in ("kept", "checkpointed"):
-        error = np.linalg.norm(found[name] - found["replay"])
-        assert error <= 1e-6 * np.linalg.norm(found["replay"])
+        error = np.linalg.norm(gradients[name] - gradients["replay"])
+        assert error <= 1e-6 * np.linalg.norm(gradients["replay"])
 
 
 def test_light_varies_alike_in_all_images():

@@ -54,11 +54,14 @@ POSES = np.array([[0.0, 0.35, 0.02], [0.1, 0.2, -0.03]])
 def test_attached_gradient_is_that_of_the_whole_loop(horizon, changes, rng):
     loop, item = toy.make_loop(**changes)  # Euler feels a control after two steps
     rollout = make_rollout(loop, horizon, attached=True)
-    found = texture_gradient(rollout)
-    along = unit(found)
-    for direction in (along, unit(along + 0.5 * unit(rng.normal(size=found.shape)))):
+    derivative = texture_gradient(rollout)
+    along = unit(derivative)
+    for direction in (
+        along,
+        unit(along + 0.5 * unit(rng.normal(size=derivative.shape))),
+    ):
         value = along_texture(rollout, item, direction)
-        expected = float((found * direction).sum())
+        expected = float((derivative * direction).sum())
         assert central_difference(value, 0.2) == pytest.approx(expected, rel=1e-3)
 
 
@@ -66,23 +69,23 @@ def test_detached_gradient_of_disturbed_drives_holds_the_camera_path(rng):
     loop, item = toy.make_loop(jitter_seed=7, disturbance=DISTURBANCE)
     rollout = make_rollout(loop, 4)
     evaluation = rollout.run(loop.initial(POSES))
-    found = rollout.gradient(evaluation).textures[0].numpy().astype(float)
+    derivative = rollout.gradient(evaluation).textures[0].numpy().astype(float)
     held = replace(rollout, camera_path=CameraPath(evaluation.trajectory.states))
-    base, direction = toy.texture_of(item), unit(rng.normal(size=found.shape))
-    direction = unit(unit(found) + 0.5 * direction)
+    base, direction = toy.texture_of(item), unit(rng.normal(size=derivative.shape))
+    direction = unit(unit(derivative) + 0.5 * direction)
 
     def value(s):
         loop.sensor.set_textures([(base + s * direction).astype(np.float32)])
         return objective(held, POSES)
 
-    expected = float((found * direction).sum())
+    expected = float((derivative * direction).sum())
     assert central_difference(value, 0.2) == pytest.approx(expected, rel=1e-3)
 
 
 def test_attached_gradient_by_the_initial_state():
     loop, _ = toy.make_loop()
     rollout = make_rollout(loop, 5, attached=True)
-    found = np.array(gradient(rollout).initial)[:, 0]
+    by_start = np.array(gradient(rollout).initial)[:, 0]
     for axis, step in ((0, 4e-2), (1, 4e-2), (2, 1e-2)):
 
         def value(s, axis=axis):
@@ -90,7 +93,9 @@ def test_attached_gradient_by_the_initial_state():
             moved[0, axis] += s
             return objective(rollout, moved)
 
-        expected = pytest.approx(found[axis], rel=1e-3, abs=1e-3 * np.abs(found).max())
+        expected = pytest.approx(
+            by_start[axis], rel=1e-3, abs=1e-3 * np.abs(by_start).max()
+        )
         assert central_difference(value, step) == expected
 
 
@@ -102,7 +107,9 @@ def test_gradient_by_the_pose_of_an_object(composite, axes):
     rollout = make_rollout(loop, 4, attached=True)
     (item,) = loop.sensor.objects
     item.move(OFFSET[0])
-    found = offset_gradients(loop.sensor, gradient(rollout, more=loop.sensor.pose_keys))
+    by_pose = offset_gradients(
+        loop.sensor, gradient(rollout, extra_keys=loop.sensor.pose_keys)
+    )
     for axis in axes:
 
         def value(s, axis=axis):
@@ -111,16 +118,16 @@ def test_gradient_by_the_pose_of_an_object(composite, axes):
 
         # samples that cross the faces of cells, kinks of the field, cost accuracy, as
         # do the ends of the interval on the ray, which count as constants
-        scale = np.abs(found[0, 3 * (axis // 3) :][:3]).max()
-        expected = pytest.approx(found[0, axis], rel=2e-2, abs=2e-2 * scale)
+        scale = np.abs(by_pose[0, 3 * (axis // 3) :][:3]).max()
+        expected = pytest.approx(by_pose[0, axis], rel=2e-2, abs=2e-2 * scale)
         assert central_difference(value, 3e-3) == expected
 
 
 def test_euler_needs_two_steps_to_feel_a_control():
     loop, _ = toy.make_loop()
-    found = gradient(make_rollout(loop, 1, attached=True))
-    assert not found.textures[0].numpy().any()
-    assert found.costates.shape == (1, 1, 3)
+    derivative = gradient(make_rollout(loop, 1, attached=True))
+    assert not derivative.textures[0].numpy().any()
+    assert derivative.costates.shape == (1, 1, 3)
 
 
 def test_a_batch_is_one_sequence_of_launches():
@@ -148,15 +155,15 @@ def test_jitter_is_replayed():
 
 def test_adjoints_agree_and_compile_nothing_after_the_first_steps():
     loop, _ = toy.make_loop(jitter_seed=7, disturbance=DISTURBANCE)
-    found = {}
+    gradients = {}
     for adjoint in ADJOINTS:
         gradient(make_rollout(loop, 4, adjoint=adjoint), POSES)
         with nothing_compiled():
             rollout = make_rollout(loop, 4, adjoint=adjoint)
-            found[adjoint] = texture_gradient(rollout, POSES + 0.07)
+            gradients[adjoint] = texture_gradient(rollout, POSES + 0.07)
     for name in ("kept", "checkpointed"):
-        error = np.linalg.norm(found[name] - found["replay"])
-        assert error <= 1e-6 * np.linalg.norm(found["replay"])
+        error = np.linalg.norm(gradients[name] - gradients["replay"])
+        assert error <= 1e-6 * np.linalg.norm(gradients["replay"])
 
 
 def test_memory_does_not_grow_with_the_horizon(monkeypatch):
@@ -243,20 +250,20 @@ def test_another_mount_makes_another_image():
 
 @pytest.mark.parametrize("attached", [False, True])
 def test_sensors_see_the_pose_alone_of_longer_states(attached):
-    sensor, found = toy.make_loop()[0].sensor, []
+    sensor, outputs = toy.make_loop()[0].sensor, []
     # as many as make (n, 4) and (n, 3) the same number of values in some order
     poses = np.array([[0.0, 0.0, 0.1], [0.5, -0.3, 0.0], [0.2, 0.4, -0.2]])
     for states in (poses, np.c_[poses, [0.3, -0.2, 0.1]]):
         state = to_state(states)
-        seen = sensor.observe(state, 0)
-        weight = np.linspace(-1, 1, dr.width(seen.image.array), dtype=np.float32)
+        observation = sensor.observe(state, 0)
+        weight = np.linspace(-1, 1, dr.width(observation.image.array), dtype=np.float32)
         sensor.start_gradient()
-        d_image = mi.TensorXf(weight.reshape(seen.image.shape))
-        by_pose = sensor.vjp(seen, state, d_image, attached)
+        d_image = mi.TensorXf(weight.reshape(observation.image.shape))
+        by_pose = sensor.vjp(observation, state, d_image, attached)
         rows = by_pose.numpy()[:3] if attached else np.zeros(3)
         texture = sensor.texture_gradients()[0].numpy().copy()
-        found.append((seen.image.numpy(), texture, rows))
-    short, long = found
+        outputs.append((observation.image.numpy(), texture, rows))
+    short, long = outputs
     np.testing.assert_array_equal(long[0], short[0])
     np.testing.assert_allclose(long[1], short[1], rtol=1e-4, atol=1e-7)
     np.testing.assert_allclose(long[2], short[2], rtol=1e-4)
@@ -266,9 +273,9 @@ def test_kept_frames_are_not_rendered_again():
     loop, _ = toy.make_loop()
     rollout = make_rollout(loop, 3, adjoint="kept")
     evaluation = rollout.run(loop.initial(INITIAL))
-    kept = evaluation.trajectory.kept
+    tape = evaluation.trajectory.tape
     samples = toy.WIDTH * toy.HEIGHT
-    for scene, thing in (state.seen for (state,), _ in kept):
+    for scene, thing in (state.marches for (state,), _ in tape):
         met = dr.width(thing.index)  # by the object
         assert 0 < met < samples / 2 < samples == dr.width(scene) == thing.count
         assert dr.width(thing.march) == met
@@ -283,10 +290,14 @@ def test_kept_frames_are_not_rendered_again():
 def test_what_is_kept_gives_the_same_image_again():
     loop, _ = toy.make_loop()
     sensor, state = loop.sensor, loop.initial(INITIAL)
-    seen = sensor.observe(state, 2)
-    again = sensor.restore(state, 2, sensor.keep(seen))
-    assert dr.all(seen.image.array == again.image.array)
-    for one, other in zip(seen.kept.seen.layers, again.kept.seen.layers, strict=True):
+    observation = sensor.observe(state, 2)
+    again = sensor.restore(state, 2, sensor.keep(observation))
+    assert dr.all(observation.image.array == again.image.array)
+    for one, other in zip(
+        observation.integrator_state.marches.layers,
+        again.integrator_state.marches.layers,
+        strict=True,
+    ):
         for name in ("radiance", "opacity", "moment"):
             assert dr.all(getattr(one, name) == getattr(other, name), axis=None)
 

@@ -50,11 +50,13 @@ def folder(tmp_path: Path, variant: str) -> Path:
 
 
 def scene(
-    folder: Path, walls: bool = False, random: bool = False, **more: Any
+    folder: Path, walls: bool = False, random: bool = False, **entries: Any
 ) -> mi.Scene:
     """Load fields in fog, between them a wall that a nested prb shows."""
     nested = {"behind": {"type": "prb", "max_depth": 2}} if walls else {}
-    described = walled.scene_dict(folder, walled.PERSPECTIVE, walls, **nested, **more)
+    described = walled.scene_dict(
+        folder, walled.PERSPECTIVE, walls, **nested, **entries
+    )
     if random:
         described["sensor"]["sampler"] = {"type": "independent"}
         described["integrator"]["jitter"] = True
@@ -113,11 +115,11 @@ def test_image_is_that_of_mi_render(folder, kind) -> None:
     loaded = board() if kind == "prb" else scene(folder, kind.endswith("wall"))
     if kind == "prb":  # one light, no other random number
         loaded.integrator().max_depth = 1
-    seen = SceneSensor(loaded, toy.MOUNT).observe(to_state(STATE), 0)
-    found = seen.linear.numpy().T.reshape(toy.HEIGHT, toy.WIDTH, 3)
+    observation = SceneSensor(loaded, toy.MOUNT).observe(to_state(STATE), 0)
+    image = observation.linear.numpy().T.reshape(toy.HEIGHT, toy.WIDTH, 3)
     expected = rendered(loaded, STATE)
     assert expected.std() > 0.01
-    assert np.sqrt(((found - expected) ** 2).mean()) < 1e-6
+    assert np.sqrt(((image - expected) ** 2).mean()) < 1e-6
 
 
 def test_vehicles_are_rendered_together(folder) -> None:
@@ -169,15 +171,15 @@ def test_gradient_of_a_drive_at_a_held_camera_path(folder, case) -> None:
     opt = mi.ad.Adam(lr=0.05, params={key: params[key]})
     params.update(opt)
     dr.backward(drive(params, initial))
-    found = float((dr.grad(opt[key]).numpy().astype(float) * along).sum())
+    derivative = float((dr.grad(opt[key]).numpy().astype(float) * along).sum())
 
     def value(s: float) -> float:
         moved = type(params[key])(base + s * along)
         drive.loop.sensor.set_parameters({key: moved})
         return drive.measure(initial).value
 
-    assert abs(found) > 1e-6
-    assert found == pytest.approx(central_difference(value, 0.02), rel=1e-3)
+    assert abs(derivative) > 1e-6
+    assert derivative == pytest.approx(central_difference(value, 0.02), rel=1e-3)
 
 
 def test_an_attached_gradient_is_that_of_the_whole_loop(folder) -> None:
@@ -185,30 +187,30 @@ def test_an_attached_gradient_is_that_of_the_whole_loop(folder) -> None:
     initial, sensor = drive.loop.initial(STATE), drive.loop.sensor
     base = sensor.params[KEY].numpy().copy()
     along = direction(base)
-    found = drive.gradient(drive.run(initial)).parameters[KEY].numpy()
+    gradient = drive.gradient(drive.run(initial)).parameters[KEY].numpy()
 
     def value(s: float) -> float:
         sensor.set_parameters({KEY: mi.TensorXf(base + s * along)})
         return drive.measure(initial).value
 
     expected = central_difference(value, 0.02)
-    assert float((found * along).sum()) == pytest.approx(expected, rel=0.05)
+    assert float((gradient * along).sum()) == pytest.approx(expected, rel=0.05)
 
 
 def test_all_adjoints_agree_and_nothing_stays_attached(folder) -> None:
     keys = [KEY, "fields.near.density", "fields.far.to_world"]
-    loaded, found = scene(folder), []
+    loaded, gradients = scene(folder), []
     for adjoint in (Replay(), KeptBackgrounds()):
         drive = drive_of(loaded, keys, 4, adjoint=adjoint)
         evaluation, sensor = drive.run(drive.loop.initial(BOTH)), drive.loop.sensor
-        found.append(drive.gradient(evaluation).parameters)
+        gradients.append(drive.gradient(evaluation).parameters)
         assert not any(dr.grad_enabled(sensor.params[key]) for key in keys)
         assert not dr.grad_enabled(sensor.fields[0].packed)
         assert not any(layer.has_pose_gradients for layer in sensor.layers)
     for key in keys[:2]:
-        one, other = (parameters[key].numpy() for parameters in found)
+        one, other = (parameters[key].numpy() for parameters in gradients)
         np.testing.assert_allclose(one, other, atol=1e-5 * np.abs(one).max())
-    one, other = (np.array(parameters[keys[2]].matrix) for parameters in found)
+    one, other = (np.array(parameters[keys[2]].matrix) for parameters in gradients)
     assert np.abs(one).max() > 0
     np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5 * np.abs(one).max())
 
@@ -280,10 +282,10 @@ def test_nothing_is_left_of_a_gradient_that_failed_or_of_images(folder) -> None:
         dr.enable_grad(params[KEY])
         params.update()
         dr.backward(dr.sum(mi.render(loaded, params), axis=None))
-        found = dr.grad(params[KEY]).numpy().copy()
+        derivative = dr.grad(params[KEY]).numpy().copy()
         params[KEY] = dr.detach(params[KEY])
         params.update()
-        return found
+        return derivative
 
     rendered(loaded, STATE)  # puts the scene's sensor there
     expected = gradient()
@@ -296,8 +298,8 @@ def test_nothing_is_left_of_a_gradient_that_failed_or_of_images(folder) -> None:
     with pytest.raises(KeyboardInterrupt):
         drive.gradient(evaluation, sensor.pose_keys, on_step=interrupt)
     assert not dr.grad_enabled(params["fields.near.to_world"].matrix)
-    found = gradient()
-    np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+    actual = gradient()
+    np.testing.assert_allclose(actual, expected, atol=1e-4 * np.abs(expected).max())
 
 
 ROOT = Path(nf.__file__).parents[1]
@@ -321,9 +323,9 @@ def test_a_frame_and_its_gradient_enter_few_files():
 
     sys.setprofile(note)
     try:
-        seen = sensor.observe(state, 0)
+        observation = sensor.observe(state, 0)
         sensor.start_gradient()
-        sensor.vjp(seen, state, ones, attached=False)
+        sensor.vjp(observation, state, ones, attached=False)
         (gradient,) = sensor.gradients().values()
     finally:
         sys.setprofile(None)

@@ -86,14 +86,14 @@ def taped_march(posed, rays, stop):
     moment = dr.zeros(mi.Float, count)
     while dr.hint(active, mode="evaluated"):
         with dr.suspend_grad():
-            walk, here = walk.next([posed], active)
-        density, colour = posed.eval(path.at(here.t), path.heading, here.active)
-        x = dr.select(here.active, density * here.width, 0)
+            walk, segment = walk.next([posed], active)
+        density, colour = posed.eval(path.at(segment.t), path.heading, segment.active)
+        x = dr.select(segment.active, density * segment.width, 0)
         weight = dr.exp(-tau) * x * absorption(x)[0]
         radiance += weight * colour
-        moment += weight * here.t
+        moment += weight * segment.t
         tau += x
-        active = here.active & (dr.exp(-dr.detach(tau)) > stop)
+        active = segment.active & (dr.exp(-dr.detach(tau)) > stop)
     return March(radiance, tau * absorption(tau)[0], moment)
 
 
@@ -113,27 +113,27 @@ def test_products_of_the_sensor_are_those_of_the_tape(rng):
     sensor = field_sensor(old.layers[0], objects, *view, stop=0.0)
     offsets = np.concatenate([OFFSET, -0.5 * OFFSET])
     move_all(sensor.objects, offsets)
-    seen = sensor.observe(state, 0)
-    layers = seen.kept.seen.layers
+    observation = sensor.observe(state, 0)
+    layers = observation.integrator_state.marches.layers
     both = (layers[1].opacity > 0.1) & (layers[2].opacity > 0.1)
     assert dr.count(both)[0] > 3
-    d_image = mi.TensorXf(rng.normal(size=seen.image.shape).astype(np.float32))
-    found = []
+    d_image = mi.TensorXf(rng.normal(size=observation.image.shape).astype(np.float32))
+    products = []
     for attached, poses in ((True, True), (False, True), (False, False)):
         sensor.start_gradient(sensor.pose_keys if poses else ())
-        by_state = sensor.vjp(seen, state, d_image, attached)
-        found += enumerate(np.array(x) for x in sensor.texture_gradients())
+        by_state = sensor.vjp(observation, state, d_image, attached)
+        products += enumerate(np.array(x) for x in sensor.texture_gradients())
         if poses:
             by_pose = Gradient([], None, np.empty(0), None, sensor.gradients())
-            found.append((2, offset_gradients(sensor, by_pose)))
-        found += [(3, np.array(by_state))] if attached else []
+            products.append((2, offset_gradients(sensor, by_pose)))
+        products += [(3, np.array(by_state))] if attached else []
         assert attached or by_state is None
 
     leaves = [leaf(x) for x in (*sensor.textures(), tensor64(offsets), state)]
     image = taped_image(sensor, leaves[3], leaves[:2], leaves[2])
-    np.testing.assert_allclose(image.numpy(), seen.image.numpy(), atol=1e-6)
+    np.testing.assert_allclose(image.numpy(), observation.image.numpy(), atol=1e-6)
     dr.backward(dr.sum(image.array * d_image.array))
-    for index, value in found:
+    for index, value in products:
         expected = np.array(dr.grad(leaves[index]))
         scale = np.abs(expected).max()
         np.testing.assert_allclose(value, expected, rtol=0, atol=2e-5 * scale)

@@ -156,7 +156,7 @@ def test_each_drive_has_its_own_vehicle(model):
     loop, _ = toy.make_loop()
     start = replace(loop, dynamics=model).initial(POSES)
     control = type(start[0])([0.3, -0.2, 0.1])
-    found = np.array(vehicle.derivative(start, control))
+    derivative = np.array(vehicle.derivative(start, control))
     for k in range(3):
         own = {"speed": model.speed * drawn.speed[k]}
         if rows > 3 or isinstance(model, Ackermann):
@@ -164,7 +164,7 @@ def test_each_drive_has_its_own_vehicle(model):
         expected = np.array(replace(model, **own).derivative(start, control))[:, k]
         if isinstance(model, Dubins):
             expected[2] *= drawn.steering[k]
-        np.testing.assert_allclose(found[:, k], expected, rtol=1e-12)
+        np.testing.assert_allclose(derivative[:, k], expected, rtol=1e-12)
 
 
 def test_a_vehicle_with_a_speed_state_is_faster_at_each_speed():
@@ -198,18 +198,18 @@ def test_steering_follows_its_command_by_a_lag(integrator):
     acting = command * (1 - np.exp(-end / lag))
     turned = command * (end - lag * (1 - np.exp(-end / lag)))
     np.testing.assert_allclose(np.array(state)[3], acting, rtol=0.01)
-    found = np.array(state)[2] - POSES[:, 2]
-    np.testing.assert_allclose(found, turned, rtol=0.01, atol=1e-3)
+    heading_change = np.array(state)[2] - POSES[:, 2]
+    np.testing.assert_allclose(heading_change, turned, rtol=0.01, atol=1e-3)
 
 
 def test_costs_see_the_rows_of_the_vehicle_alone():
     """A cost of all rows is the model's; its derivative by the lag's row is 0."""
     loop, _ = toy.make_loop()
     vehicle = Varied(loop.dynamics, Variation(steering_lag_s_sd=0.2, seed=3), 0.1)
-    loop, seen = replace(loop, dynamics=vehicle), []
+    loop, row_counts = replace(loop, dynamics=vehicle), []
 
     def cost(state):
-        seen.append(len(state))
+        row_counts.append(len(state))
         return state[len(state) - 1] ** 2  # the heading
 
     rollout = Rollout(loop, StageSum(cost), 3)
@@ -217,7 +217,7 @@ def test_costs_see_the_rows_of_the_vehicle_alone():
     headings = evaluation.trajectory.states_numpy()[:, 1:, 2]
     np.testing.assert_allclose(evaluation.costs, (headings**2).sum(1), rtol=1e-6)
     assert rollout.gradient(evaluation).costates.shape == (3, 3, 4)
-    assert set(seen) == {3}
+    assert set(row_counts) == {3}
 
 
 def test_a_lag_of_the_steering_leaves_the_pedals_alone():
@@ -259,8 +259,8 @@ def test_gradients_are_those_of_the_varied_drives(adjoint):
 
     difference = (value(1e-2) - value(-1e-2)) / 2e-2
     loop.sensor.set_textures([before])
-    found = rollout.gradient(rollout.run(initial)).textures[0].numpy()
-    assert (found * along).sum() == pytest.approx(difference, rel=0.02)
+    gradient = rollout.gradient(rollout.run(initial)).textures[0].numpy()
+    assert (gradient * along).sum() == pytest.approx(difference, rel=0.02)
 
 
 def test_light_falls_on_the_objects_that_there_were():
@@ -286,7 +286,7 @@ def test_light_leaves_splats_as_they_were_captured():
     after = plain.varied(light).observe(state, 0)
     shown = take_apart(plain, before, dr.zeros(type(before.linear.x), 1))
     gain = np.repeat(light.draws(0, 3).light, toy.WIDTH * toy.HEIGHT, axis=1)
-    more = (gain - 1) * shown.objects[0].radiance.numpy()
-    expected = before.linear.numpy() + more
-    assert shown.others[0].opacity.numpy().max() > 0.1 and abs(more).max() > 0.05
+    added_light = (gain - 1) * shown.objects[0].radiance.numpy()
+    expected = before.linear.numpy() + added_light
+    assert shown.others[0].opacity.numpy().max() > 0.1 and abs(added_light).max() > 0.05
     np.testing.assert_allclose(after.linear.numpy(), expected, atol=2e-6)

@@ -57,12 +57,12 @@ def test_environments_are_called_by_name(load, tmp_path, text, expected):
 
 
 def test_conditions_are_those_of_the_table(load):
-    given = {"sky": "noon", "exposure_ev": -0.5, "blur_px": 0.5, "noise_sd": 0.1}
-    keys = "\n".join(f"{name} = {value!r}" for name, value in given.items())
-    for kind, more in (('"mitsuba"\nspp = 4', {"spp": 4}), ('"mujoco_gl"', {})):
+    conditions = {"sky": "noon", "exposure_ev": -0.5, "blur_px": 0.5, "noise_sd": 0.1}
+    keys = "\n".join(f"{name} = {value!r}" for name, value in conditions.items())
+    for kind, samples in (('"mitsuba"\nspp = 4', {"spp": 4}), ('"mujoco_gl"', {})):
         section = load(f"{TABLE}kind = {kind}\n{keys}\n")[0].deployment
-        (found,) = deployments(section, bundled_place()).values()
-        assert found.conditions == Conditions(**given, **more)
+        (environment,) = deployments(section, bundled_place()).values()
+        assert environment.conditions == Conditions(**conditions, **samples)
 
 
 def test_the_car_with_wheels_is_the_vehicles_size(load):

@@ -51,9 +51,9 @@ def test_the_guides_example(text, rng):
     )
     memory = policy.initial_memory(2)
     for _ in range(2):
-        given, before = (image, 0, memory), memory
-        control, memory = policy.step(*given, speeds)
-    d_image, d_memory, d_speed = policy.step_vjp(*given, mi.Float(1, 1), (), speeds)
+        inputs, before = (image, 0, memory), memory
+        control, memory = policy.step(*inputs, speeds)
+    d_image, d_memory, d_speed = policy.step_vjp(*inputs, mi.Float(1, 1), (), speeds)
     assert np.isfinite(control).all() and np.all(np.array(d_speed) != 0)
     assert np.array(d_image).any((1, 2, 3)).all()
     assert [d.shape for d in d_memory] == [m.shape for m in before]
@@ -67,11 +67,11 @@ def test_the_slices_are_shown_and_no_pickle_is_run(text, capsys):
         assert re.search(rf"(?s){name}.*?{start}\n.*?{stop}\n", shown)
 
 
-@pytest.mark.parametrize(("period", "found"), [(0.05, 0), (0.1, 1)])
-def test_check_tells_of_another_period(period, found, text):
+@pytest.mark.parametrize(("period", "count"), [(0.05, 0), (0.1, 1)])
+def test_check_tells_of_another_period(period, count, text):
     scenario = load(text.replace("dt_s = 0.05", f"dt_s = {period}"))
     lines = list(period_findings(SimpleNamespace(scenario=scenario)))
-    assert len(lines) == found and all("0.05 s between" in line for line in lines)
+    assert len(lines) == count and all("0.05 s between" in line for line in lines)
 
 
 def test_a_key_and_a_weight_change_the_digest(text):

@@ -201,15 +201,15 @@ def test_resolve(tmp_path):
 @pytest.mark.parametrize("rank", [1, 3])
 def test_initial_poses_scatter_by_the_covariance(load, rank):
     root = np.random.default_rng(0).normal(size=(3, rank)) * [[0.5], [0.2], [0.02]]
-    wanted = root @ root.T
-    scenario, _ = load(f"{HEAD}[drive]\ncovariance = {wanted.tolist()}\n")
+    covariance = root @ root.T
+    scenario, _ = load(f"{HEAD}[drive]\ncovariance = {covariance.tolist()}\n")
     route = Route("north", 0, np.array([[2.0, 1.0], [2.0, 9.0], [4.0, 20.0]]))
     states = initial_states(scenario, route, 20001, 0)
     # along the lane is +y, to the left of it -x
     shifts = (states - [2.0, 1.0, np.pi / 2])[:, [1, 0, 2]] * [1, -1, 1]
-    deviation = np.sqrt(wanted.diagonal())
+    deviation = np.sqrt(covariance.diagonal())
     scale = np.outer(deviation, deviation)
-    np.testing.assert_allclose(np.cov(shifts.T) / scale, wanted / scale, atol=0.04)
+    np.testing.assert_allclose(np.cov(shifts.T) / scale, covariance / scale, atol=0.04)
     np.testing.assert_allclose(shifts.mean(axis=0) / deviation, 0, atol=0.04)
 
 
@@ -319,11 +319,11 @@ def test_a_changed_file_is_noticed(tmp_path, way):
     inner = BITMAP.format("value='t.png'")
     (tmp_path / "inner.xml").write_text(f'<scene version="3.0.0">{inner}</scene>')
     scene.write_text(f"<scene version='3.0.0'>{body}</scene>")
-    found = []
+    digests = []
     for value in ("400 1\n700 1\n", "400 1\n700 2\n"):
         named.write_text(value)
-        found.append(NamedFile("scene.xml", scene).content()["sha256"])
-    assert found[0] != found[1]
+        digests.append(NamedFile("scene.xml", scene).content()["sha256"])
+    assert digests[0] != digests[1]
 
 
 @pytest.mark.usefixtures("variant")

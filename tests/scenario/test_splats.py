@@ -46,7 +46,7 @@ def paths(tmp_path: Path, variant: str) -> dict[str, str]:
     return {name: str(tmp_path / name) for name in ("cube.safetensors", "wall.ply")}
 
 
-def scene(paths: dict[str, str], shift: float, **more: Any) -> Any:
+def scene(paths: dict[str, str], shift: float, **entries: Any) -> Any:
     """Load the wall at x = -4 and the cube at x = shift, seen from x = 6."""
     at = mi.ScalarTransform4f().translate
     integrator = {
@@ -64,12 +64,12 @@ def scene(paths: dict[str, str], shift: float, **more: Any) -> Any:
             "to_world": at([shift, 0, 0]),
         },
     }
-    integrator |= more.pop("integrator", {})
+    integrator |= entries.pop("integrator", {})
     view = mi.ScalarTransform4f().look_at([6, 0, 0], [0, 0, 0], [0, 0, 1])
     film = {"type": "hdrfilm", "width": 9, "height": 9, "rfilter": {"type": "box"}}
     camera = {"type": "perspective", "fov": 30, "to_world": view, "film": film}
     return mi.load_dict(
-        {"type": "scene", "integrator": integrator, "sensor": camera, **more},
+        {"type": "scene", "integrator": integrator, "sensor": camera, **entries},
         parallel=False,
     )
 
@@ -226,8 +226,8 @@ def build(paths):
 
 def test_a_scenario_drives_among_splats(build) -> None:
     sensor = build(SCENARIO).surrogate
-    seen = sensor.observe(to_state(np.zeros((1, 3))), 0).kept.seen
-    depth = seen.layers[0].depth.numpy().reshape(6, 12)  # the wall at x = 9
+    marches = sensor.observe(to_state(np.zeros((1, 3))), 0).integrator_state.marches
+    depth = marches.layers[0].depth.numpy().reshape(6, 12)  # the wall at x = 9
     ahead = np.cos(np.arctan(1 / 12)) * np.cos(np.radians(6) - np.arctan(1 / 12))
     assert depth[2, 6] == pytest.approx((9 - 0.5) / ahead, rel=0.02)
 

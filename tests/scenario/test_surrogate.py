@@ -68,9 +68,9 @@ NAMED = {FIELD: '[scene]\nsurrogate = "surrogate.xml"', OBJECT + PLACED: ""}
 def load(tmp_path):
     """Write the tiny scenario with changes, and read it."""
 
-    def inner(changes=NAMED, more="", add=""):
+    def inner(changes=NAMED, objects="", add=""):
         folder = write_scenario(tmp_path, changes)
-        (folder / "surrogate.xml").write_text(XML.replace("<!-- more -->", more))
+        (folder / "surrogate.xml").write_text(XML.replace("<!-- more -->", objects))
         path = folder / "scenario.toml"
         path.write_text(path.read_text() + add)
         return load_scenario(path)[0]
@@ -96,7 +96,7 @@ def test_attached_takes_rays_enough(load, changes):
 
 
 def test_files_of_the_scene_are_part_of_the_identity(load, tmp_path):
-    scenario = load(more='<include filename="wall.xml"/>')
+    scenario = load(objects='<include filename="wall.xml"/>')
     (tmp_path / "wall.xml").write_text(
         '<scene version="3.0.0"><texture type="bitmap" id="wall">'
         '<string name="filename" value="brick"/></texture></scene>'
@@ -121,7 +121,7 @@ def test_what_the_xml_says_is_said_once(load, lines):
 
 
 def test_attached_with_surfaces_is_refused_before_the_first_drive(load):
-    scenario = load({**NAMED, "[attack]": "[attack]\nattached = true"}, more=WALL)
+    scenario = load({**NAMED, "[attack]": "[attack]\nattached = true"}, objects=WALL)
     with pytest.raises(InputError, match="surrogate.xml: .*attached to false"):
         build_surrogate(scenario)
 
@@ -133,8 +133,8 @@ def test_objects_of_the_xml_are_checked_where_they_stand(load, tmp_path):
     xml = tmp_path / "surrogate.xml"
     xml.write_text(xml.read_text().replace('y="4.2"', 'y="2"'))
     world = build_world(scenario, scenario.policy.build())
-    (found,) = place_findings(world)
-    assert "ball stands on the lane" in found
+    (finding,) = place_findings(world)
+    assert "ball stands on the lane" in finding
 
 
 @pytest.mark.slow
@@ -143,7 +143,7 @@ def test_attack_writes_its_run_folder(load, tmp_path):
     from mi_nerfattack.experiment.job import Job
 
     fewer = {"iterations = 30": "iterations = 1", "textures = 4": "textures = 1"}
-    scenario = load({**NAMED, **fewer}, more=WALL)
+    scenario = load({**NAMED, **fewer}, objects=WALL)
     text = (tmp_path / "scenario.toml").read_text()
     output = tmp_path / "run"
     Job(scenario, text, scenario.policy.build(), output).run()
@@ -189,10 +189,10 @@ SIZE = {"width": 100, "height": 33}
 
 def scenario():
     """Return the demo's, of a small image with samples in the middle of intervals."""
-    found, _ = load_scenario(bundled("demo.toml"))
-    camera = found.camera.model_copy(update=SIZE)
-    attack = found.attack.model_copy(update={"jitter": False})
-    return found.model_copy(update={"camera": camera, "attack": attack})
+    demo, _ = load_scenario(bundled("demo.toml"))
+    camera = demo.camera.model_copy(update=SIZE)
+    attack = demo.attack.model_copy(update={"jitter": False})
+    return demo.model_copy(update={"camera": camera, "attack": attack})
 
 
 def test_the_scenario_drives_in_the_scene_that_the_file_shows():
@@ -204,10 +204,10 @@ def test_the_scenario_drives_in_the_scene_that_the_file_shows():
     linear = mi.render(scene, spp=1).numpy()
     near = to_state(np.array([world.route.pose_at(16.0)]))
     weight = None
-    found = []
+    gradients = []
     for one in (world.surrogate, sensor):
-        seen = one.observe(to_state(start[None]), 0).linear.numpy().T
-        error = seen.reshape(linear.shape) - linear
+        pixels = one.observe(to_state(start[None]), 0).linear.numpy().T
+        error = pixels.reshape(linear.shape) - linear
         assert np.sqrt((error**2).mean()) < 1e-5
         image = one.observe(near, 0)
         if weight is None:
@@ -215,8 +215,8 @@ def test_the_scenario_drives_in_the_scene_that_the_file_shows():
             weight = mi.TensorXf(rng.normal(size=shape).astype(np.float32))
         one.start_gradient()
         one.vjp(image, near, weight, False)
-        found.append(one.texture_gradients()[0].numpy().copy())
+        gradients.append(one.texture_gradients()[0].numpy().copy())
         one.stop_gradient()
-    (expected, other), size = found, np.abs(found[0]).sum()
+    (expected, other), size = gradients, np.abs(gradients[0]).sum()
     assert size > 1
     assert np.abs(other - expected).sum() < 1e-3 * size

@@ -180,5 +180,5 @@ def test_the_reader_names_the_command_which_does_it(tmp_path, capsys):
     ],
 )
 def test_an_only_environment_was_once_called_deployment(name, text, expected):
-    found = upgraded_environment(name, parse_toml("old.toml", text))
-    assert found == (expected or name)
+    environment = upgraded_environment(name, parse_toml("old.toml", text))
+    assert environment == (expected or name)

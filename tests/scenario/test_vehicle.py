@@ -181,11 +181,11 @@ def test_hard_steering_with_a_lag_stays_within_a_centimetre(keys):
 
 
 def test_models_with_a_speed_state():
-    found = vehicle(kind="kinematic_single_track", speed_ms=7.0, max_brake_ms2=6.0)
+    section = vehicle(kind="kinematic_single_track", speed_ms=7.0, max_brake_ms2=6.0)
     steer = np.radians(34.0)
     model = models.KinematicSingleTrack(7.0, steer, 3.0, 6.0, 0.5, 2.7)
-    assert found.build() == model and found.has_expert and found.unit == "rad"
-    (acceleration,) = found.car().more_controls
+    assert section.build() == model and section.has_expert and section.unit == "rad"
+    (acceleration,) = section.car().more_controls
     assert (acceleration.lowest, acceleration.highest) == (-6.0, 3.0)
     slips = vehicle(kind="dynamic_single_track", mass_kg=1000.0, friction=0.5)
     car, built = slips.car(), slips.build()

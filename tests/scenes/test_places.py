@@ -231,11 +231,11 @@ def test_country_road_is_marked_at_the_borders_of_its_lanes() -> None:
 
 def test_country_leaves_are_closed_and_none_is_over_the_road() -> None:
     leaves = mesh_of(plants.plant(SEED, Scenery(SEED, 2)))
-    parts = leaves.split(only_watertight=False)
-    assert len(parts) > 300
-    for part in parts:
-        assert part.is_watertight and part.volume > 0
-        assert part.bounds[1, 2] - part.bounds[0, 2] < 12.0
+    components = leaves.split(only_watertight=False)
+    assert len(components) > 300
+    for component in components:
+        assert component.is_watertight and component.volume > 0
+        assert component.bounds[1, 2] - component.bounds[0, 2] < 12.0
     place = leaves.vertices[:, :2]
     ends = layout.at(np.array([0.0, layout.LENGTH]))
     to_end = np.linalg.norm(place[:, None] - ends, axis=2).min(axis=1)

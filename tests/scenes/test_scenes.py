@@ -41,8 +41,8 @@ def test_manifest_reports_each_kind_of_difference(tmp_path) -> None:
     (tmp_path / "longer.bin").write_bytes(b"abcd")
     (tmp_path / "missing.bin").unlink()
     (tmp_path / "extra.bin").write_bytes(b"")
-    found = [problem.partition(": ")[0] for problem in manifest.problems(tmp_path)]
-    assert found == ["missing.bin", "extra.bin", "changed.bin", "longer.bin"]
+    names = [problem.partition(": ")[0] for problem in manifest.problems(tmp_path)]
+    assert names == ["missing.bin", "extra.bin", "changed.bin", "longer.bin"]
 
 
 test_refused = refusals(
@@ -77,22 +77,22 @@ def test_objects_are_metric_closed_and_as_their_scripts(
     world = script.world_mesh()
     np.testing.assert_allclose(world.extents, extent, atol=0.01)
     assert world.bounds[0, 2] == pytest.approx(0, abs=1e-9)
-    for part, _ in script.parts():
+    for part, _ in script.coloured_meshes():
         assert part.is_watertight and part.volume > 0
     script.build(tmp_path / "a.glb")
     paths = bundled(f"{name}/{name}.glb"), tmp_path / "a.glb"
-    kept, built = (trimesh.load(path, force="mesh") for path in paths)
-    np.testing.assert_allclose(kept.vertices, built.vertices, atol=1e-6)
-    np.testing.assert_array_equal(kept.faces, built.faces)
-    colours = [mesh.visual.vertex_colors for mesh in (kept, built)]
+    stored, built = (trimesh.load(path, force="mesh") for path in paths)
+    np.testing.assert_allclose(stored.vertices, built.vertices, atol=1e-6)
+    np.testing.assert_array_equal(stored.faces, built.faces)
+    colours = [mesh.visual.vertex_colors for mesh in (stored, built)]
     np.testing.assert_array_equal(*colours)
-    x, y, z = np.asarray(kept.vertices).T  # glTF's y up to z up
+    x, y, z = np.asarray(stored.vertices).T  # glTF's y up to z up
     np.testing.assert_allclose(np.c_[x, -z, y], world.vertices, atol=1e-6)
 
 
 def test_routes_lie_on_the_lane_centres() -> None:
-    kept = files.read_json(bundled("intersection/routes.json"))
-    check_routes(layout.routes(), kept)
+    stored = files.read_json(bundled("intersection/routes.json"))
+    check_routes(layout.routes(), stored)
     for name, entry in layout.routes().items():
         points = np.array(entry["points_m"])
         x, y = points.T
@@ -154,8 +154,8 @@ def test_policy_record_and_card_tell_one_story(name: str) -> None:
         assert sums[file.removeprefix(f"{place}/")] == digest, file
     folders = {file.partition("/")[0] for file in record.checksums}
     assert folders & {"car", "cube", "hydrant"} == objects
-    found = {file.partition("/")[0] for file in card["place"]}
-    assert found >= objects - {"hydrant"}
+    card_folders = {file.partition("/")[0] for file in card["place"]}
+    assert card_folders >= objects - {"hydrant"}
 
 
 STRAIGHT = 2 * (loop.TRACK_HALF - loop.CORNER_RADIUS)
@@ -183,18 +183,20 @@ def check_routes(one: dict, two: dict) -> None:
 def test_builds_to_what_is_bundled(tmp_path, place, make, seed) -> None:
     """Not to the bytes: zlib's depend on its version, a sine's on the processor."""
     for path in make(tmp_path, seed=seed):
-        kept = bundled(f"{place}/{path.relative_to(tmp_path).as_posix()}")
+        stored = bundled(f"{place}/{path.relative_to(tmp_path).as_posix()}")
         if path.suffix == ".png":
-            one, two = (files.read_image(item).astype(int) for item in (path, kept))
+            one, two = (files.read_image(item).astype(int) for item in (path, stored))
             assert np.abs(one - two).max() <= 1
         elif path.suffix == ".ply":
-            one, two = (trimesh.load_mesh(item, process=False) for item in (path, kept))
+            one, two = (
+                trimesh.load_mesh(item, process=False) for item in (path, stored)
+            )
             np.testing.assert_allclose(one.vertices, two.vertices, atol=1e-6)
             np.testing.assert_array_equal(one.faces, two.faces)
         elif path.suffix == ".json":
-            check_routes(*(files.read_json(item) for item in (path, kept)))
+            check_routes(*(files.read_json(item) for item in (path, stored)))
         else:
-            assert path.read_bytes() == kept.read_bytes()
+            assert path.read_bytes() == stored.read_bytes()
 
 
 def test_the_loop_is_closed_even_and_fit_for_the_car() -> None:
@@ -231,11 +233,11 @@ def test_the_policy_sees_the_picture_that_it_was_trained_with() -> None:
     assert (camera.width, camera.height) == (336, 188) and mount == place.mount
     top, bottom, left, right = scenario.policy.preprocess.crop_px
     size = camera.width - left - right, camera.height - top - bottom
-    kept = Camera(*size, camera.fx, camera.fy, camera.cx - left, camera.cy - top)
+    cropped = Camera(*size, camera.fx, camera.fy, camera.cx - left, camera.cy - top)
     resize = scenario.policy.preprocess.resize_px
-    seen, wanted = kept.resized(*resize), place.camera
-    assert (seen.width, seen.height) == (wanted.width, wanted.height)
-    assert (seen.cx, seen.cy) == pytest.approx((wanted.cx, wanted.cy))
-    assert seen.fx == pytest.approx(wanted.fx)
+    resized, expected = cropped.resized(*resize), place.camera
+    assert (resized.width, resized.height) == (expected.width, expected.height)
+    assert (resized.cx, resized.cy) == pytest.approx((expected.cx, expected.cy))
+    assert resized.fx == pytest.approx(expected.fx)
     # rows are squeezed by so little that the outermost moves by less than half a pixel
-    assert abs(seen.fy / wanted.fy - 1) * wanted.height / 2 < 0.5
+    assert abs(resized.fy / expected.fy - 1) * expected.height / 2 < 0.5

@@ -22,9 +22,9 @@ MEANT = {
 
 
 def test_the_wall_clock_is_read_where_the_date_is_meant():
-    found = {
+    paths = {
         path.relative_to(PACKAGE).as_posix()
         for path in PACKAGE.rglob("*.py")
         if re.search(WALL, path.read_text("utf-8"))
     }
-    assert found == MEANT
+    assert paths == MEANT

@@ -213,9 +213,9 @@ def test_a_name_that_two_packages_offer_is_refused(installed):
 def test_a_condition_is_named_in_label_and_identity():
     condition = parse_condition("noise:0.1,nothing:2")
     assert condition.label == "noise:0.1,nothing:2"
-    found = condition.identity()
-    assert found["others"] == [("nothing", 2.0)]
-    assert found["packages"]["nothing"].startswith("other 1.0, code ")
+    identity = condition.identity()
+    assert identity["others"] == [("nothing", 2.0)]
+    assert identity["packages"]["nothing"].startswith("other 1.0, code ")
     assert "others" not in parse_condition("noise:0.1").identity()
 
 

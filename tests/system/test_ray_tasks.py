@@ -37,8 +37,8 @@ if __name__ == "__main__":
 def test_tasks_tell_what_became_of_them(tmp_path):
     """In a process of its own: Ray leaves threads and files behind."""
     (tmp_path / "run.py").write_text(SCRIPT)
-    here = os.path.dirname(__file__)
-    paths = os.pathsep.join([here, *sys.path])
+    folder = os.path.dirname(__file__)
+    paths = os.pathsep.join([folder, *sys.path])
     result = subprocess.run(
         [sys.executable, str(tmp_path / "run.py")],
         env={**os.environ, "PYTHONPATH": paths},
@@ -47,9 +47,9 @@ def test_tasks_tell_what_became_of_them(tmp_path):
         timeout=600,
     )
     assert result.returncode == 0, result.stderr
-    told = json.loads(result.stdout.splitlines()[-1])
-    assert told["3"] == ["NoneType", "None"] and told["usage"] == "0"
-    assert told["0"][0] == "RuntimeError" and "IndexError" in told["0"][1]
-    assert told["1"] == ["InputError", "piece one: is wrong; take another"]
-    assert told["2"][0] == "InputError" and "in piece 2" in told["2"][1]
-    assert "no machine has 2 cores and 10000 GB for a task" in told["refused"]
+    outcomes = json.loads(result.stdout.splitlines()[-1])
+    assert outcomes["3"] == ["NoneType", "None"] and outcomes["usage"] == "0"
+    assert outcomes["0"][0] == "RuntimeError" and "IndexError" in outcomes["0"][1]
+    assert outcomes["1"] == ["InputError", "piece one: is wrong; take another"]
+    assert outcomes["2"][0] == "InputError" and "in piece 2" in outcomes["2"][1]
+    assert "no machine has 2 cores and 10000 GB for a task" in outcomes["refused"]

@@ -48,7 +48,7 @@ from mi_nerfattack.vehicle.route.route import load_routes
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-HERE, SOURCE, ROUTES = InThisProcess(), Scattered(), (straight(),)
+LOCAL, SOURCE, ROUTES = InThisProcess(), Scattered(), (straight(),)
 
 
 def follower(route):
@@ -61,7 +61,7 @@ def site() -> PaintedSite:
 
 
 def gather(folder, site, source=SOURCE, routes=ROUTES, **changes):
-    shards = collect(site, list(routes), source, small(**changes), folder, HERE)
+    shards = collect(site, list(routes), source, small(**changes), folder, LOCAL)
     return shards, FrameDataset.from_shards(shards)
 
 
@@ -91,7 +91,9 @@ def test_frames_carry_the_experts_control_and_goal(site, tmp_path):
         arc = route.project_numpy(states[mine])[0]
         assert -3 < arc.min() and arc.max() < route.length + 3
     frames = data.read_frames(np.arange(120))
-    levels = [about["level"] for about in conditions_of(shards) for _ in range(12)]
+    levels = [
+        conditions["level"] for conditions in conditions_of(shards) for _ in range(12)
+    ]
     expected = [painted(s, Grey(k)) for s, k in zip(states, levels, strict=True)]
     np.testing.assert_array_equal(frames[:, 2, 3], expected)
 
@@ -100,22 +102,22 @@ def test_conditions_change_from_shard_to_shard(site, tmp_path):
     shards, _ = gather(tmp_path, site, frames=113, object_share=0.0)
     sizes = [len(FrameDataset.from_shards([shard])) for shard in shards]
     assert sizes == [12] * 9 + [5]  # the last one has the rest
-    levels = [about["level"] for about in conditions_of(shards)]
+    levels = [conditions["level"] for conditions in conditions_of(shards)]
     assert set(levels) == {0, 1, 2}
     # loaded only where they differ
     changes = 1 + sum(a != b for a, b in zip(levels, levels[1:], strict=False))
     assert len(site.opened) == changes
     bare = PaintedSite(objects=False)
     gather(tmp_path / "bare", bare, routes=[bent()])
-    assert not any(any(item.seen) for item in (*site.opened, *bare.opened))
+    assert not any(any(item.shown) for item in (*site.opened, *bare.opened))
 
 
 def test_up_to_six_objects_come_and_go_ahead_of_the_vehicles(site, tmp_path):
     shards, _ = gather(tmp_path, site, frames=160, objects=6)
-    seen = [objects for item in site.opened for objects in item.seen]
-    assert {len(objects) for objects in seen} == set(range(7))
-    assert 0.55 < np.mean([bool(objects) for objects in seen]) < 0.95
-    for objects, state in zip(seen, states_of(site), strict=True):
+    shown = [objects for item in site.opened for objects in item.shown]
+    assert {len(objects) for objects in shown} == set(range(7))
+    assert 0.55 < np.mean([bool(objects) for objects in shown]) < 0.95
+    for objects, state in zip(shown, states_of(site), strict=True):
         for posed in objects:
             x, y, _ = posed.pose.translation
             # in view from 3 m before the group to 8 m after it, or at the route's end
@@ -123,7 +125,7 @@ def test_up_to_six_objects_come_and_go_ahead_of_the_vehicles(site, tmp_path):
             assert abs(y) > 1.75 + 0.3 + 0.2
     counts = [record_of(shard)["objects"] for shard in shards]
     groups = sum(int(n) * times for count in counts for n, times in count.items())
-    assert 4 * groups == sum(map(len, seen))
+    assert 4 * groups == sum(map(len, shown))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,7 +143,7 @@ def test_no_ground_is_wanted_beyond_a_routes_end(tmp_path):
     """Near the end objects stand before it, or there are fewer."""
     site = IslandSite()
     gather(tmp_path, site, frames=96, object_share=1.0)
-    shown = [objects for item in site.opened for objects in item.seen]
+    shown = [objects for item in site.opened for objects in item.shown]
     late = [o for o, s in zip(shown, states_of(site), strict=True) if s[0] > 36]
     assert late and all(late)
     ends = [posed.pose.translation[0] for objects in shown for posed in objects]
@@ -257,9 +259,9 @@ def test_shards_of_a_place_have_their_light(tmp_path):
     options = {"routes": load_routes(site.place.routes), "object_share": 0.0}
     shards, data = gather(tmp_path, site, frames=24, shard=4, **options)
     means: dict[float, list[float]] = {-2.0: [], 2.0: []}
-    for number, about in enumerate(conditions_of(shards)):
+    for number, conditions in enumerate(conditions_of(shards)):
         frames = data.read_frames(np.arange(4) + 4 * number)
-        means[about["exposure_ev"]].append(frames.mean())
+        means[conditions["exposure_ev"]].append(frames.mean())
     assert max(means[-2.0]) < min(means[2.0]) - 30
 
 
@@ -269,14 +271,14 @@ class AcceleratedSite(PaintedSite):
 
     @property
     def car(self):
-        more = (Control("acceleration", "m/s^2", -8.0, 3.0),)
-        limits = {"control_unit": "rad", "max_control": 0.6, "more_controls": more}
+        controls = (Control("acceleration", "m/s^2", -8.0, 3.0),)
+        limits = {"control_unit": "rad", "max_control": 0.6, "more_controls": controls}
         return dataclasses.replace(CAR, **limits)
 
     def open(self, conditions):
         car, motion = self.car, Motion(KinematicSingleTrack())
-        rest = car.max_control, car.control_unit, car.more_controls
-        vehicle = KinematicVehicle(motion, self.period, *rest)
+        limits = car.max_control, car.control_unit, car.more_controls
+        vehicle = KinematicVehicle(motion, self.period, *limits)
         view = BlankView()
         rig = Rig.of_one(view.camera, CameraMount())
         return SimulatedEnvironment("blank", vehicle, [view], rig, self.period)

@@ -118,8 +118,8 @@ def test_a_dead_worker_is_told_in_a_line_and_leaves_no_other(
 
 
 def test_too_little_memory_of_a_worker_is_told_in_a_line():
-    told = workers._failed(MemoryError("249 TiB"))  # by the worker
-    error = workers.failure(2, told)
+    report = workers._failed(MemoryError("249 TiB"))  # by the worker
+    error = workers.failure(2, report)
     assert isinstance(error, InputError) and "\n" not in str(error)
     assert "249 TiB" in str(error) and "workers" in error.remedy
 

@@ -45,7 +45,7 @@ from mi_nerfattack.training.validation import (
 pytestmark = pytest.mark.usefixtures("variant")
 
 SITE = PaintedSite("mitsuba", size_px=(200, 66))
-HERE = InThisProcess()
+LOCAL = InThisProcess()
 DRIVE = EvaluateSettings(runs=1, objects=(), horizon=3)
 SETTINGS = ImitationSettings(
     frames={"mitsuba": 64},
@@ -72,7 +72,7 @@ def test_imitation_runs_from_frames_to_card_and_resumes(tmp_path):
         if stage not in stages:
             stages.append(stage)
 
-    first = imitate([SITE], ROUTES, SETTINGS, tmp_path, HERE, note)
+    first = imitate([SITE], ROUTES, SETTINGS, tmp_path, LOCAL, note)
     assert stages == [
         "round_0, mitsuba",
         "training 0",
@@ -88,15 +88,15 @@ def test_imitation_runs_from_frames_to_card_and_resumes(tmp_path):
     assert first.best_round == ranks.index(min(ranks))
     files.write_json(tmp_path / "card.json", first.card)
     stages.clear()
-    again = imitate([SITE], ROUTES, SETTINGS, tmp_path, HERE, note)
+    again = imitate([SITE], ROUTES, SETTINGS, tmp_path, LOCAL, note)
     assert "training 0" not in stages
     assert again.history == first.history
     weights = (item.module.state_dict().values() for item in (first, again))
     assert all(torch.equal(*pair) for pair in zip(*weights, strict=True))
-    more = imitate([SITE], ROUTES, LONGER, tmp_path, HERE)
-    assert more.history[:2] == first.history and len(more.history) == 3
+    longer = imitate([SITE], ROUTES, LONGER, tmp_path, LOCAL)
+    assert longer.history[:2] == first.history and len(longer.history) == 3
     with pytest.raises(InputError, match=r"checkpoint_0.*\n  start: .* -> .*\nrestore"):
-        imitate([SITE], ROUTES, SETTINGS, tmp_path, HERE, start=PilotNet(2))
+        imitate([SITE], ROUTES, SETTINGS, tmp_path, LOCAL, start=PilotNet(2))
 
 
 def rows(data: FrameDataset) -> set[tuple[bytes, float]]:
@@ -112,7 +112,7 @@ def test_rows_that_are_held_out_are_never_trained_on(monkeypatch, tmp_path):
         return fit_policy(module, data, *arguments, held_out=held_out, **keywords)
 
     monkeypatch.setattr(module, "fit_policy", fit)
-    result = imitate([SITE], ROUTES, LONGER, tmp_path, HERE)
+    result = imitate([SITE], ROUTES, LONGER, tmp_path, LOCAL)
     assert len(rounds) == 3 and len(result.shards) == (64 + 32 + 32) // 8
     trained = set().union(*(rows(data) for data, _ in rounds))
     for number, (data, held) in enumerate(rounds):
@@ -128,7 +128,7 @@ def test_rounds_of_other_seeds_have_other_frames(tmp_path):
     frames, order = {}, {}
     for seed in (0, 1):
         settings = dataclasses.replace(SETTINGS, seed=seed)
-        imitate([SITE], ROUTES, settings, tmp_path / f"{seed}", HERE)
+        imitate([SITE], ROUTES, settings, tmp_path / f"{seed}", LOCAL)
         for number in (0, 1):
             shard = f"round_{number}/mitsuba/shard_0000"
             for name, seeds in ((shard, frames), (f"checkpoint_{number}", order)):
@@ -140,8 +140,8 @@ def test_rounds_of_other_seeds_have_other_frames(tmp_path):
 @pytest.mark.slow
 def test_frames_of_rounds_that_are_left_out_are_not_recorded(tmp_path):
     data = tmp_path / "data"
-    imitate([SITE], ROUTES, LONGER, data, HERE)
-    every = imitate([SITE], ROUTES, SETTINGS, data, HERE).shards
+    imitate([SITE], ROUTES, LONGER, data, LOCAL)
+    every = imitate([SITE], ROUTES, SETTINGS, data, LOCAL).shards
     assert count_frames(data, every) == {"round_0/mitsuba": 64, "round_1/mitsuba": 32}
     assert count_frames(tmp_path, every[:1]) == {"data/round_0/mitsuba": 8}
     assert count_frames(tmp_path / "b", every[:1]) == {"earlier/mitsuba": 8}
@@ -152,7 +152,7 @@ def test_a_collection_of_its_own_is_held_out(tmp_path):
         SETTINGS, dagger_rounds=0, validation_frames={"mitsuba": 40}
     )
     stages = []
-    imitate([SITE], ROUTES, settings, tmp_path, HERE, lambda *at: stages.append(at[0]))
+    imitate([SITE], ROUTES, settings, tmp_path, LOCAL, lambda *at: stages.append(at[0]))
     assert "held_out, mitsuba" in stages
     folders = tmp_path / "round_0", tmp_path / "held_out"
     one, other = (FrameDataset.from_shards(find_shards(at)) for at in folders)
@@ -264,7 +264,7 @@ def drives(**changes):
 def test_what_cannot_be_trained_is_refused(tmp_path, change, message):
     with pytest.raises(InputError, match=message):
         settings = dataclasses.replace(SETTINGS, **change)
-        imitate([SITE], ROUTES, settings, tmp_path, HERE)
+        imitate([SITE], ROUTES, settings, tmp_path, LOCAL)
     assert not list(tmp_path.iterdir())  # told before the first frame
 
 
@@ -272,8 +272,8 @@ def test_what_cannot_be_trained_is_refused(tmp_path, change, message):
 class AcceleratedSite(PaintedSite):
     @property
     def car(self):
-        more = (Control("acceleration", "m/s^2", -8.0, 3.0),)
-        limits = {"control_unit": "rad", "max_control": 0.6, "more_controls": more}
+        controls = (Control("acceleration", "m/s^2", -8.0, 3.0),)
+        limits = {"control_unit": "rad", "max_control": 0.6, "more_controls": controls}
         return dataclasses.replace(CAR, **limits)
 
 
@@ -312,20 +312,32 @@ MISSING = [SITE, MissingSite("mujoco", size_px=(200, 66))]
         ({"routes": [dataclasses.replace(bent(), goal=1000)]}, "'left': goal 1000"),
         ({"sites": [PaintedSite("mitsuba", size_px=(100, 50))]}, "100 x 50 px; .* 66"),
         ({"sites": [AcceleratedSite("mitsuba", size_px=(200, 66))]}, "acceleration"),
-        ({"more": two_controls}, "other.safetensors: controls: 2 of each frame"),
+        (
+            {"earlier_shards": two_controls},
+            "other.safetensors: controls: 2 of each frame",
+        ),
         ({"start": PilotNet(2, unit="rad")}, r"start: .*\(2, 1.5, 'rad/s'\)"),
-        ({"more": frames_of((100, 50), 0)}, "other.safetensors: .* 100 x 50 px"),
-        ({"more": frames_of((200, 66), 2)}, "other.safetensors: goals: 2 to 2"),
-        ({"more": steered}, "other.safetensors: controls in rad; .* in rad/s: leave"),
+        (
+            {"earlier_shards": frames_of((100, 50), 0)},
+            "other.safetensors: .* 100 x 50 px",
+        ),
+        (
+            {"earlier_shards": frames_of((200, 66), 2)},
+            "other.safetensors: goals: 2 to 2",
+        ),
+        (
+            {"earlier_shards": steered},
+            "other.safetensors: controls in rad; .* in rad/s: leave",
+        ),
         ({"sites": MISSING, "settings": BOTH}, "pip install it"),
     ],
 )
 def test_goals_cameras_frames_and_weights_must_fit(tmp_path, change, message):
     arguments = {"sites": [SITE], "routes": ROUTES, "settings": SETTINGS} | change
-    if "more" in change:
-        arguments["more"] = change["more"](tmp_path)
+    if "earlier_shards" in change:
+        arguments["earlier_shards"] = change["earlier_shards"](tmp_path)
     with pytest.raises(InputError, match=message):
-        imitate(folder=tmp_path / "data", workers=HERE, **arguments)
+        imitate(folder=tmp_path / "data", workers=LOCAL, **arguments)
     assert not any((tmp_path / "data").rglob("*"))  # told before the first frame
 
 
@@ -338,8 +350,8 @@ def test_goals_are_numbers_of_manoeuvres_not_of_routes(tmp_path, goals):
     settings = dataclasses.replace(SETTINGS, dagger_rounds=0, frames=frames)
     # first weights may have more goals
     start = PilotNet(3) if goals[0] == goals[1] else None
-    found = imitate([SITE], routes, settings, tmp_path, HERE, start=start)
-    assert found.module.goals == 3
+    imitated = imitate([SITE], routes, settings, tmp_path, LOCAL, start=start)
+    assert imitated.module.goals == 3
     data = FrameDataset.from_shards(find_shards(tmp_path))
     assert set(data.goals) == set(goals)
 
@@ -363,8 +375,8 @@ def test_a_training_writes_down_its_data_and_settings(tmp_path):
     result = Imitated(PilotNet(2).eval(), rows, 0, {}, [shard])
     record = training_record(settings, [PaintedSite()], tmp_path, result, "train it")
     write_trained(tmp_path / "net.safetensors", result.module, record)
-    found = read_record(tmp_path / "net.json")
-    assert found and found.model_dump() == record.model_dump(mode="json")
+    stored = read_record(tmp_path / "net.json")
+    assert stored and stored.model_dump() == record.model_dump(mode="json")
     nothing = training_record(settings, [], tmp_path / "empty", result, "")
     assert nothing.data == {"earlier/painted": 12}
     facts = training_facts(record)

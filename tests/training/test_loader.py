@@ -92,8 +92,8 @@ def test_waypoints_of_a_drive_are_where_the_expert_came(tmp_path):
             assert steps[later] == steps[row] + periods
             offset = complex(*poses[later, :2]) - complex(x, y)
             expected = offset * np.exp(-1j * heading)
-            found = complex(*waypoints[row, index])
-            assert abs(found - expected) < 1e-5
+            waypoint = complex(*waypoints[row, index])
+            assert abs(waypoint - expected) < 1e-5
             compared += 1
     assert compared > 50
     lateral = column(frames, "cross_track")[column(frames, "step") == 0]
@@ -163,8 +163,8 @@ def test_a_data_loader_gives_the_same_frames_in_order(drives, workers):
     assert [len(batch.image) for batch in batches] == [12, 12, 8]
     assert batches[0].image.shape == (12, 2, 3, 4, 8)
     for name in frames[0]._fields:
-        found = torch.cat([getattr(batch, name) for batch in batches])
-        np.testing.assert_array_equal(found.numpy(), column(frames, name))
+        values = torch.cat([getattr(batch, name) for batch in batches])
+        np.testing.assert_array_equal(values.numpy(), column(frames, name))
 
 
 def test_an_interrupted_collection_ends_with_the_same_columns(drives, tmp_path):
@@ -199,9 +199,9 @@ def of_earlier_version(folder: Path) -> None:
     gather(folder, Scattered(), frames=12)
     (shard,) = folder.rglob("*.safetensors")
     tensors, metadata = files.read_safetensors(shard)
-    kept = {name: tensors[name] for name in ("frames", "goals", "controls")}
+    columns = {name: tensors[name] for name in ("frames", "goals", "controls")}
     metadata["format"] = "mi_nerfattack frames 1"
-    files.write_safetensors(shard, kept, metadata)
+    files.write_safetensors(shard, columns, metadata)
     assert len(FrameDataset.from_shards([shard])) == 12  # for --more
     with pytest.raises(InputError, match="frames 1.*start again without the file"):
         gather(folder, Scattered(), frames=12)

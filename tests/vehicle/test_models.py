@@ -100,9 +100,9 @@ def test_jacobians(dynamics, limit):
         tangent = rng.normal(size=point.shape)
         tangent[m] *= limit
         expected = difference(call, point, tangent, 3e-4)
-        found = forward_mode(call, point, tangent, cotangent)
+        actual = forward_mode(call, point, tangent, cotangent)
         atol = 1e-8 * np.abs(expected).max()
-        np.testing.assert_allclose(found, expected, rtol=1e-8, atol=atol)
+        np.testing.assert_allclose(actual, expected, rtol=1e-8, atol=atol)
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -119,9 +119,9 @@ def test_derivatives_of_a_step(integrator, dynamics, function):
             return integrator.step(dynamics, x_prev, u, 0.1)
         return integrator.residual(dynamics, x_prev, x, u, 0.1)
 
-    found = forward_mode(call, point, tangent, cotangent)
+    actual = forward_mode(call, point, tangent, cotangent)
     expected = difference(call, point, tangent, 1e-3)
-    np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
+    np.testing.assert_allclose(actual, expected, rtol=1e-7, atol=1e-8)
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -168,10 +168,10 @@ def test_steps_converge_to_scipys_solution(integrator, order):
 
 def test_midpoint_is_its_closed_form():
     # Dubins' heading is linear in time, so the implicit step has a closed form.
-    found = drive(Dubins(5.0), [1.0, 2.0, 0.4], [0.7], 0.1, ImplicitMidpoint())[:, 1]
+    state = drive(Dubins(5.0), [1.0, 2.0, 0.4], [0.7], 0.1, ImplicitMidpoint())[:, 1]
     middle = 0.4 + 0.05 * 0.7
     exact = [1 + 0.5 * np.cos(middle), 2 + 0.5 * np.sin(middle), 0.47]
-    np.testing.assert_allclose(found, exact, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(state, exact, rtol=0, atol=1e-14)
 
 
 def test_vehicles_start_at_rest():
@@ -278,11 +278,11 @@ def test_float32_state_and_batch_of_the_active_variant():
         kind = mi.Vector3f if m == 3 else mi.ArrayXf
         state = kind(*[mi.Float(row) for row in x])
         for integrator in INTEGRATORS:
-            found = integrator.step(dynamics, state, mi.Float(u), 0.1)
-            integrator.check(dynamics, state, found, mi.Float(u), 0.1)
+            after = integrator.step(dynamics, state, mi.Float(u), 0.1)
+            integrator.check(dynamics, state, after, mi.Float(u), 0.1)
             expected = integrator.step(dynamics, state64(x), row64(u), 0.1)
-            assert type(found) is kind
-            np.testing.assert_allclose(found.numpy(), expected.numpy(), atol=1e-6)
+            assert type(after) is kind
+            np.testing.assert_allclose(after.numpy(), expected.numpy(), atol=1e-6)
 
 
 @pytest.mark.parametrize("size", [1, 2, 4, 6])
@@ -298,8 +298,8 @@ def test_solve_columns(size):
 
     def rows(matrices, vectors):
         """Flatten to rows (m (m + 1), n), column by column."""
-        whole = np.concatenate([matrices, vectors], 2)
-        return whole.transpose(2, 1, 0).reshape(-1, 6)
+        augmented = np.concatenate([matrices, vectors], 2)
+        return augmented.transpose(2, 1, 0).reshape(-1, 6)
 
     def call(values):
         columns = [values[i * size : (i + 1) * size] for i in range(size + 1)]
@@ -307,8 +307,8 @@ def test_solve_columns(size):
         return solve_columns(columns, last)
 
     point, tangent = rows(systems, right), rows(d_systems, d_right)
-    found = call([row64(value) for value in point]).numpy().T
-    np.testing.assert_allclose(found, x[..., 0], rtol=1e-12)
-    found = forward_mode(call, point, tangent, weight[..., 0].T).T
+    solution = call([row64(value) for value in point]).numpy().T
+    np.testing.assert_allclose(solution, x[..., 0], rtol=1e-12)
+    derivative = forward_mode(call, point, tangent, weight[..., 0].T).T
     expected = np.linalg.solve(systems, d_right - d_systems @ x)[..., 0]
-    np.testing.assert_allclose(found, expected, rtol=1e-11)
+    np.testing.assert_allclose(derivative, expected, rtol=1e-11)

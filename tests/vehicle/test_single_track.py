@@ -73,12 +73,12 @@ def test_derivatives(model):
         result = call(rows)
         for row, direction in zip(rows, tangent, strict=True):
             dr.set_grad(row, row64(direction))
-        found = dr.forward_to(result, flags=dr.ADFlag.ClearEdges).numpy()
+        slope = dr.forward_to(result, flags=dr.ADFlag.ClearEdges).numpy()
         high, low = (
             call([row64(value) for value in point + s * tangent]).numpy()
             for s in (h, -h)
         )
-        np.testing.assert_allclose(found, (high - low) / (2 * h), rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(slope, (high - low) / (2 * h), rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -156,8 +156,8 @@ def test_slow_tyres_roll():
     path = drive(replace(SLIPPING, speed=1.0), ([0.4], [0.0]), 2.0, 0.01)
     turned = float(twin.derivative(state64([[0.0]] * 3), row64([0.4]))[2][0])
     assert path[-1, 5] == pytest.approx(turned * path[-1, 3], rel=0.06)
-    rest = drive(SLIPPING, ([0.4], [-8.0]), 2.0, 0.01, start=[[0.0]] * 6)
-    np.testing.assert_allclose(rest, 0, atol=1e-12)
+    standing = drive(SLIPPING, ([0.4], [-8.0]), 2.0, 0.01, start=[[0.0]] * 6)
+    np.testing.assert_allclose(standing, 0, atol=1e-12)
 
 
 def test_steps_within_the_fastest_rate_stay_calm():
@@ -186,9 +186,9 @@ def test_speeds():
     x = state64(state[:4])
     dr.enable_grad(x)
     # of the base class, which differentiates the position, with two controls
-    found = AbstractDynamics.speed_of(ROLLING, x)
-    np.testing.assert_allclose(found.numpy(), [6, 7], rtol=1e-12)
-    dr.backward(dr.sum(found))
+    speed = AbstractDynamics.speed_of(ROLLING, x)
+    np.testing.assert_allclose(speed.numpy(), [6, 7], rtol=1e-12)
+    dr.backward(dr.sum(speed))
     np.testing.assert_allclose(dr.grad(x).numpy()[3], [1, 1], rtol=1e-12)
 
 
@@ -203,11 +203,11 @@ def test_single_precision_stays_single():
         x = np.random.default_rng(4).normal(size=(model.state_size, 5)) * 0.4
         u = np.array([[0.1] * 5, [-1.0] * 5])
         state, control = (mi.ArrayXf(*[mi.Float(r) for r in v]) for v in (x, u))
-        found = RK4().step(model, state, model.saturate(control), 0.01)
+        single = RK4().step(model, state, model.saturate(control), 0.01)
         limited = model.saturate(controls64(*u))
         double = RK4().step(model, state64(x), limited, 0.01)
-        assert type(found) is mi.ArrayXf
-        np.testing.assert_allclose(found.numpy(), double.numpy(), atol=1e-5)
+        assert type(single) is mi.ArrayXf
+        np.testing.assert_allclose(single.numpy(), double.numpy(), atol=1e-5)
 
 
 test_refused = refusals(

@@ -30,8 +30,8 @@ LAG = RateLimitedAckermann(4.0, 2.5, 0.6, 0.9, 0.15)
 
 
 def lag_in_drjit(state, control):
-    wanted = (control - state[3]) / 0.15 / 0.9
-    rate = 0.9 * wanted / (1 + wanted**8) ** 0.125
+    ratio = (control - state[3]) / 0.15 / 0.9
+    rate = 0.9 * ratio / (1 + ratio**8) ** 0.125
     sin, cos = dr.sincos(state[2])
     return [4 * cos, 4 * sin, 4 / 2.5 * dr.tan(state[3]), rate]
 
@@ -65,20 +65,20 @@ def test_own_model_equals_ours(framework, count, integrator):
         dr.set_grad(control, row64(t_u))
         return [value, *reverse, dr.forward_to(end).numpy().copy()]
 
-    for found, expected in zip(products(own), products(LAG), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-13)
+    for actual, expected in zip(products(own), products(LAG), strict=True):
+        np.testing.assert_allclose(actual, expected, rtol=1e-11, atol=1e-13)
     assert own.recordable == (framework == "drjit")
 
 
 def test_what_may_be_returned():
     own = TorchDynamics(lambda x, u: torch.stack([x[:, 0], x[:, 1], u], 1))
     state = dr.llvm.ad.Array3f(1, 2, dr.llvm.ad.Float(3, 4))  # single precision
-    found = own.derivative(state, dr.llvm.ad.Float(0.5, 0.25))
-    assert type(found) is type(state)
-    np.testing.assert_array_equal(found.numpy(), [[1, 1], [2, 2], [0.5, 0.25]])
+    rates = own.derivative(state, dr.llvm.ad.Float(0.5, 0.25))
+    assert type(rates) is type(state)
+    np.testing.assert_array_equal(rates.numpy(), [[1, 1], [2, 2], [0.5, 0.25]])
     own = FunctionDynamics(lambda x, u: (1.5, dr.cos(x[2]), u))  # numbers, single rows
-    found = own.derivative(state64(np.zeros((3, 4))), row64([1, 2, 3, 4]))
-    np.testing.assert_array_equal(found.numpy(), [[1.5] * 4, [1.0] * 4, [1, 2, 3, 4]])
+    rates = own.derivative(state64(np.zeros((3, 4))), row64([1, 2, 3, 4]))
+    np.testing.assert_array_equal(rates.numpy(), [[1.5] * 4, [1.0] * 4, [1, 2, 3, 4]])
     own = FunctionDynamics(lambda x, u: (dr.abs(x[0]), dr.maximum(x[1], 0), u))  # kinks
     start = state64([[0.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
     require_model("own", own, start, row64([0.1, 0.2]))
@@ -100,8 +100,8 @@ F, T = FunctionDynamics, TorchDynamics
 REFUSED = (
     ((2,), "size: 2"),
     ((3, 0.0), "limit: 0.0"),
-    ((3, 1.0, (1.0,)), "rest: .*; 0 finite"),
-    ((4, 1.0, (float("nan"),)), r"rest: \(nan,\)"),
+    ((3, 1.0, (1.0,)), "rest_state: .*; 0 finite"),
+    ((4, 1.0, (float("nan"),)), r"rest_state: \(nan,\)"),
 )
 test_arguments_that_are_refused = refusals(
     *(

@@ -26,8 +26,8 @@ class Fog(AbstractAround):
         return self._foggy(self.inside.step(control))
 
     def _foggy(self, frame: CameraFrame) -> CameraFrame:
-        seen = np.exp(-self.density * frame.depth)[..., None]  # 0 where nothing is
-        image = np.round(seen * frame.image + (1 - seen) * GREY).astype(np.uint8)
+        weight = np.exp(-self.density * frame.depth)[..., None]  # 0 where nothing is
+        image = np.round(weight * frame.image + (1 - weight) * GREY).astype(np.uint8)
         return replace(frame, image=image, linear=None, split=None)
 
 

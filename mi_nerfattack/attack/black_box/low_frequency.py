@@ -53,11 +53,11 @@ class LowFrequency:
 
     def propose(self, coefficients: np.ndarray) -> Proposal:
         """Return what coefficients make: (count,), by x, y, z, channel, in C order."""
-        parts = np.split(np.asarray(coefficients), self._ends[:-1])
+        per_object = np.split(np.asarray(coefficients), self._ends[:-1])
         colours = [
             colouring.project(start + _spread(part, axes))
             for colouring, start, part, axes in zip(
-                self.colourings, self._middle, parts, self._weights, strict=True
+                self.colourings, self._middle, per_object, self._weights, strict=True
             )
         ]
         return propose(self.colourings, colours)

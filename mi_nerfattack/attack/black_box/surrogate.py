@@ -55,10 +55,10 @@ class SurrogateJudge:
         sensor = textured(self.rollout.loop)
         sensor.set_textures(list(textures))
         before = sensor.renders
-        seen = self.rollout.measure(self.initial, on_step)
-        error = distances(self.route, seen)
+        evaluation = self.rollout.measure(self.initial, on_step)
+        error = distances(self.route, evaluation)
         frames = sensor.renders - before
-        return Judged(seen.value, float(error.mean()), float(error.max()), frames)
+        return Judged(evaluation.value, float(error.mean()), float(error.max()), frames)
 
 
 class SurrogateSearch(AbstractAttack):
@@ -107,8 +107,8 @@ class SurrogateSearch(AbstractAttack):
     @property
     def best(self) -> list[np.ndarray]:
         """See ``AbstractAttack.best``."""
-        found = self._attack.best
-        return self._original if found is None else found
+        textures = self._attack.best
+        return self._original if textures is None else textures
 
     def step(self, on_step: OnStep | None = None) -> IterationRecord:
         """See ``AbstractAttack.step``."""
@@ -119,8 +119,8 @@ class SurrogateSearch(AbstractAttack):
         objective, mean = judged.objective, judged.cross_track_mean_m
         if objective < self.best_objective:
             self.best_objective, self.best_mean_m = objective, mean
-        numbers = objective, mean, judged.cross_track_max_m
-        self.history.append(IterationRecord(self.iteration, *numbers))
+        largest = judged.cross_track_max_m
+        self.history.append(IterationRecord(self.iteration, objective, mean, largest))
 
     def curve(self, backward_multiple: float) -> np.ndarray:
         """See ``AbstractAttack.curve``; this attack has no backward pass."""
@@ -177,8 +177,9 @@ class Task:
     @property
     def colourings(self) -> list[Colours]:
         """What may change of the texture of each object."""
-        found = [self.freedom.colouring(field) for field in self.fields]
-        return [item for item in found if isinstance(item, Colours)]  # which all are
+        colourings = [self.freedom.colouring(field) for field in self.fields]
+        # All of them are Colours.
+        return [item for item in colourings if isinstance(item, Colours)]
 
     @property
     def frames(self) -> int:

@@ -157,11 +157,11 @@ class Allowed:
         gradient = np.zeros(self._cube, np.float32)
         if weight == 0.0:
             return 0.0, gradient.reshape(value.shape)
-        cube, seen = value.reshape(self._cube), self._counts.reshape(self._cube[:3])
+        cube, counted = value.reshape(self._cube), self._counts.reshape(self._cube[:3])
         total, pairs = 0.0, 0
         for axis in range(3):
             first, second = neighbours(axis)
-            both = (seen[first] & seen[second])[..., None]
+            both = (counted[first] & counted[second])[..., None]
             change = np.where(both, cube[second] - cube[first], 0)
             small = np.abs(change) < _SMALL
             size = np.where(small, change**2 / (2 * _SMALL) + _SMALL / 2, abs(change))
@@ -199,12 +199,12 @@ def vertex_points(
 
 def _colouring(field: GridField, level: GridLevel) -> np.ndarray:
     """Tell which vertices have a part in the colour of an occupied cell, (n,)."""
-    found = field.window.cells.transpose()  # by z, y, x
+    occupied = field.window.cells.transpose()  # by z, y, x
     index = np.arange(level.resolution)
-    for axis, count in enumerate(found.shape):
+    for axis, count in enumerate(occupied.shape):
         first = np.floor((index - 1) / level.scale * count).clip(0, count - 1)
         last = np.ceil((index + 1) / level.scale * count).clip(1, count)
         ranges = zip(first.astype(int), last.astype(int), strict=True)
-        parts = [found.take(range(a, b), axis).any(axis) for a, b in ranges]
-        found = np.stack(parts, axis)
-    return np.asarray(found.ravel(), bool)
+        slabs = [occupied.take(range(a, b), axis).any(axis) for a, b in ranges]
+        occupied = np.stack(slabs, axis)
+    return np.asarray(occupied.ravel(), bool)

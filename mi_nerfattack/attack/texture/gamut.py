@@ -78,7 +78,7 @@ class Gamut:
             inside: (n, 3) or (3,), in the hull: what each is drawn towards.
         """
         inside = np.broadcast_to(inside, colours.shape)
-        found = colours.copy()
+        drawn = colours.copy()
         [moved] = (colours != inside).any(axis=1).nonzero()
         for some in np.array_split(moved, len(moved) // _CHUNK + 1):
             # Signed distances to the hull's planes, positive outside
@@ -89,12 +89,12 @@ class Gamut:
                 share = np.where(far > 0, np.maximum(-near, 0) / (far - near), 1.0)
             least = share.min(axis=1, initial=1.0)[:, None]
             least = np.where(least < 1, _INWARDS * least, 1.0)
-            found[some] = np.where(
+            drawn[some] = np.where(
                 least < 1,
                 inside[some] + least * (colours[some] - inside[some]),
                 colours[some],
             )
-        return found
+        return drawn
 
 
 def _of_profile(path: Path, data: bytes) -> np.ndarray:
@@ -126,7 +126,7 @@ def _of_text(path: Path, data: bytes) -> np.ndarray:
         points = np.array([line.split() for line in lines if line.strip()], float)
     except ValueError as err:
         raise InputError(f"{path}: {err}; {expected}") from err
-    whole = points.shape[1:] == (3,) and np.isfinite(points).all()
-    if not whole or points.min() < 0 or points.max() > 255:
+    is_valid = points.shape[1:] == (3,) and np.isfinite(points).all()
+    if not is_valid or points.min() < 0 or points.max() > 255:
         raise InputError(f"{path}: no list of colours; {expected}")
     return points / 255 if points.max() > 1 else points

@@ -22,7 +22,7 @@ from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
 #: A colour value nearer than this to 0 or 1 (sRGB) is saturated.
 SATURATED = 0.02
 #: Vertices with less than this share of the largest weight are not seen.
-_SEEN = 1e-3
+_LEAST_WEIGHT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -66,9 +66,9 @@ def seen_weights(
         sensor.set_textures(grey)  # where colours change by equal amounts
         sensor.start_gradient()
         for step, state in enumerate(states):
-            seen = sensor.observe(state, step)
-            ones = dr.ones(mi.TensorXf, seen.image.shape)
-            sensor.vjp(seen, state, ones, False)
+            observation = sensor.observe(state, step)
+            ones = dr.ones(mi.TensorXf, observation.image.shape)
+            sensor.vjp(observation, state, ones, False)
         gradients = sensor.texture_gradients()
     finally:
         sensor.stop_gradient()
@@ -90,47 +90,49 @@ def texture_statistics(
         weights: from :func:`seen_weights`.
     """
     texture = field.texture
-    seen = weights > _SEEN * weights.max(initial=0.0)
-    if not seen.any():
+    visible = weights > _LEAST_WEIGHT * weights.max(initial=0.0)
+    if not visible.any():
         return TextureStatistics(0.0, 0.0, 0.0, 0.0, [])
-    colour = vertex_colours(field, field.levels()[-1], seen)
+    colour = vertex_colours(field, field.levels()[-1], visible)
     try:
         field.set_parameter("texture", original)
-        change = colour - vertex_colours(field, field.levels()[-1], seen)
+        change = colour - vertex_colours(field, field.levels()[-1], visible)
     finally:
         field.set_parameter("texture", texture)
-    weight = weights[seen] / weights[seen].sum()
+    weight = weights[visible] / weights[visible].sum()
     saturated = np.minimum(colour, 1 - colour) < SATURATED
     return TextureStatistics(
         float(np.sqrt((weight * (change**2).mean(axis=1)).sum())),
         float(np.abs(change).max()),
         float(min(1, (weight * saturated.mean(axis=1)).sum())),  # weights round
-        _variation(colour, seen, weights),
-        _spectrum(change, seen, weights),
+        _variation(colour, visible, weights),
+        _spectrum(change, visible, weights),
     )
 
 
-def _spectrum(change: np.ndarray, seen: np.ndarray, weights: np.ndarray) -> list[float]:
+def _spectrum(
+    change: np.ndarray, visible: np.ndarray, weights: np.ndarray
+) -> list[float]:
     """Take a change apart by Haar's averages over blocks, weighted.
 
     What an average over eight neighbours leaves of them is structure of their size; the
     averages are taken apart likewise. The parts' squares add up to that of the whole.
     """
-    size = 1 << (max(seen.shape) - 1).bit_length()
+    size = 1 << (max(visible.shape) - 1).bit_length()
     values, weight = np.zeros((size,) * 3 + (3,)), np.zeros((size,) * 3 + (1,))
-    inside = tuple(slice(n) for n in seen.shape)
-    values[inside][seen] = change
-    weight[inside][seen] = weights[seen][:, None]
-    whole = (weight * values**2).sum()
-    if not whole:
+    inside = tuple(slice(n) for n in visible.shape)
+    values[inside][visible] = change
+    weight[inside][visible] = weights[visible][:, None]
+    total = (weight * values**2).sum()
+    if not total:
         return []
-    left = [whole]
+    left = [total]
     while len(values) > 1:
         above = _blocks(weight * values)
         weight = _blocks(weight)
         values = np.divide(above, weight, out=above, where=weight > 0)
         left.append((weight * values**2).sum())
-    return (-np.diff([*left, 0.0]) / whole).tolist()
+    return (-np.diff([*left, 0.0]) / total).tolist()
 
 
 def _blocks(cube: np.ndarray) -> np.ndarray:
@@ -142,15 +144,15 @@ def _blocks(cube: np.ndarray) -> np.ndarray:
     return cube
 
 
-def _variation(colour: np.ndarray, seen: np.ndarray, weights: np.ndarray) -> float:
+def _variation(colour: np.ndarray, visible: np.ndarray, weights: np.ndarray) -> float:
     """Average over pairs of neighbours that are both seen."""
-    grid = np.zeros((*seen.shape, 3))
-    grid[seen] = colour
+    grid = np.zeros((*visible.shape, 3))
+    grid[visible] = colour
     above = below = 0.0
     for axis in range(3):
         first, second = neighbours(axis)
         both = np.where(
-            seen[first] & seen[second],
+            visible[first] & visible[second],
             np.sqrt(np.maximum(weights[first] * weights[second], 0)),
             0,
         )

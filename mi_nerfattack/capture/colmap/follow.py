@@ -71,11 +71,11 @@ class Stages:
         """Read lines until there are no more."""
         for line in lines:
             if line.startswith(MARK):
-                self._told(json.loads(line[len(MARK) :]))
+                self._on_message(json.loads(line[len(MARK) :]))
             else:
                 self._logged(line)
 
-    def _told(self, what: dict[str, Any]) -> None:
+    def _on_message(self, what: dict[str, Any]) -> None:
         self.missing = what.get("missing")
         if "stage" in what:
             self.end()
@@ -110,9 +110,9 @@ class Stages:
 
     def ending(self, code: int) -> str:
         """Tell how the process ended, from its exit code, and what it said last."""
-        how = f"ended with code {code}"
+        outcome = f"ended with code {code}"
         if code < 0:
             with contextlib.suppress(ValueError):
-                how = f"was ended by {signal.Signals(-code).name}"
+                outcome = f"was ended by {signal.Signals(-code).name}"
         last = "; ".join(self._last) or "nothing"
-        return f"pycolmap {how} at the stage {self.name!r} (its last lines: {last})"
+        return f"pycolmap {outcome} at the stage {self.name!r} (its last lines: {last})"

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 
 from mi_nerfattack.capture.colmap.follow import Stages, run_task
-from mi_nerfattack.capture.colmap.process import PARTS, POINTS, RESULT
+from mi_nerfattack.capture.colmap.process import MODEL_STEMS, POINTS, RESULT
 from mi_nerfattack.capture.posed_images import PosedImages, differing, load_images
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
@@ -40,8 +40,8 @@ class _Image(NamedTuple):
 
 def find_model(folder: str | Path) -> Path | None:
     """Return the first of `MODEL_FOLDERS` in a folder that holds a model, or None."""
-    found = _find(Path(folder))
-    return None if found is None else found[0]
+    location = _find(Path(folder))
+    return None if location is None else location[0]
 
 
 def read_colmap(
@@ -81,12 +81,12 @@ def read_colmap(
     cameras = _cameras(source, contents["cameras"])
     records = sorted(_Image(*image) for image in contents["images"])
     _check_images(where, records)
-    found = _find_images(root, model, [record.name for record in records])
-    missing = tuple(record.name for record in records if record.name not in found)
+    image_paths = _find_images(root, model, [record.name for record in records])
+    missing = tuple(record.name for record in records if record.name not in image_paths)
     if missing and not skip_missing:
-        _refuse_missing(where, missing, len(records), found)
-    used = [record for record in records if record.name in found]
-    paths = [found[record.name] for record in used]
+        _refuse_missing(where, missing, len(records), image_paths)
+    used = [record for record in records if record.name in image_paths]
+    paths = [image_paths[record.name] for record in used]
     lenses = [cameras[record.camera_id] for record in used]
     poses = colmap_to_opencv(
         [r.quaternion for r in used], [r.translation for r in used]
@@ -106,11 +106,11 @@ def read_colmap(
 
 
 def _refuse_missing(
-    where: Path, missing: Sequence[str], count: int, found: Mapping[str, Path]
+    where: Path, missing: Sequence[str], count: int, image_paths: Mapping[str, Path]
 ) -> NoReturn:
     raise InputError(
         f"{where}: {len(missing)} of {count} images are missing, first "
-        f"{missing[0]!r} in {next(iter(found.values())).parent}; restore them or "
+        f"{missing[0]!r} in {next(iter(image_paths.values())).parent}; restore them or "
         "leave them out (--skip-missing, or skip_missing=True)"
     )
 
@@ -119,7 +119,7 @@ def _find(folder: Path) -> tuple[Path, str] | None:
     """Return the folder of a model and the suffix of its files."""
     for name in MODEL_FOLDERS:
         for suffix in (".bin", ".txt"):
-            needed = (folder / name / f"{part}{suffix}" for part in PARTS[:2])
+            needed = (folder / name / f"{part}{suffix}" for part in MODEL_STEMS[:2])
             with files.reported(folder / name):
                 if all(path.is_file() for path in needed):
                     return folder / name, suffix
@@ -132,7 +132,7 @@ def _read(model: Path, suffix: str) -> tuple[dict[str, Any], np.ndarray | None]:
     COLMAP checks little of what it reads, and reads without end in some damaged files:
     this is done in a process of its own, with limits.
     """
-    names = [f"{part}{suffix}" for part in PARTS]
+    names = [f"{part}{suffix}" for part in MODEL_STEMS]
     names = [name for name in names if (model / name).is_file()]
     with tempfile.TemporaryDirectory() as work:
         for name in names:
@@ -149,18 +149,18 @@ def _read(model: Path, suffix: str) -> tuple[dict[str, Any], np.ndarray | None]:
                 f"{model / stages.name}: {stages.ending(code)}; the file is damaged or "
                 "not of COLMAP, copy it again"
             )
-        found = json.loads((Path(work) / RESULT).read_text(encoding="utf-8"))
+        contents = json.loads((Path(work) / RESULT).read_text(encoding="utf-8"))
         points = np.load(Path(work) / POINTS)
     if not np.isfinite(points).all():
         raise InputError(
             f"{model / names[-1]}: a position is not finite; copy the file again"
         )
-    return found, points if len(points) else None
+    return contents, points if len(points) else None
 
 
 def _cameras(source: Path, records: dict[str, Sequence[Any]]) -> dict[int, Camera]:
     result = {}
-    for camera_id, (name, *rest) in records.items():
+    for camera_id, (name, *parameters) in records.items():
         where = f"{source}: camera {camera_id}"
         if name not in COLMAP_MODELS:
             raise InputError(
@@ -169,7 +169,7 @@ def _cameras(source: Path, records: dict[str, Sequence[Any]]) -> dict[int, Camer
                 "reconstruct with OPENCV"
             )
         try:
-            result[int(camera_id)] = from_colmap(name, *rest)
+            result[int(camera_id)] = from_colmap(name, *parameters)
         except InputError as error:
             raise InputError(f"{where}: {error}") from error
     return result
@@ -195,9 +195,9 @@ def _find_images(root: Path, model: Path, names: Sequence[str]) -> dict[str, Pat
     bases = dict.fromkeys((root, model, model.parent, model.parent.parent))
     folders = [path for base in bases for path in (base / "images", base)]
     for folder in folders:
-        found = {name: folder / name for name in names if os.path.isfile(folder / name)}
-        if found:
-            return found
+        paths = {name: folder / name for name in names if os.path.isfile(folder / name)}
+        if paths:
+            return paths
     raise InputError(
         f"{model}: none of the {len(names)} images is there, first {names[0]!r}; put "
         f"them into {root / 'images'} (looked in {', '.join(map(str, folders))})"

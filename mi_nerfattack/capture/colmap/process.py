@@ -25,11 +25,11 @@ from mi_nerfattack.extras import load_extra
 MARK = "@ "
 RESULT = "structure.json"
 POINTS = "points.npy"
-PARTS = ("cameras", "images", "points3D")  # of a model; the last may be missing
+MODEL_STEMS = ("cameras", "images", "points3D")  # of a model; the last may be missing
 LEAST_IMAGES = 3
 
 _MANY = 20  # photographs of a camera that may tell its principal point
-_TOLD_SD = 0.005  # of the longer edge, at most: how surely they tell it
+_MOST_SD = 0.005  # of the longer edge, at most: how surely they tell it
 _LEAST_TRACK = 3  # images that see a point which counts
 _OVERLAP = 10  # sequential: neighbours, and neighbours at distances 2^k, k < overlap
 _PURPOSE = "COLMAP: to read models and estimate poses"  # for messages
@@ -55,13 +55,13 @@ def run(task: dict[str, Any]) -> int:
     pycolmap.logging.logtostderr = True  # no file among the temporary ones
     work = Path(task["work"])
     if "files" not in task:
-        found = _reconstruct(pycolmap, task, work)
+        structure = _reconstruct(pycolmap, task, work)
     else:
         try:
-            found = _read(pycolmap, task["files"], work)
+            structure = _read(pycolmap, task["files"], work)
         except Exception as error:  # of pycolmap, about the files
             sys.exit(f"{type(error).__name__}: {error}")
-    (work / RESULT).write_text(json.dumps(found), encoding="utf-8")
+    (work / RESULT).write_text(json.dumps(structure), encoding="utf-8")
     return 0
 
 
@@ -80,22 +80,22 @@ def _read(pycolmap: Any, names: list[str], work: Path) -> dict[str, Any]:
     size = sum((work / name).stat().st_size for name in names)
     _limit("RLIMIT_CPU", 6 + size // 1_000_000)
     _limit("RLIMIT_AS", (2 << 30) + 10 * size)
-    for part in PARTS:
+    for part in MODEL_STEMS:
         (folder / f"{part}{suffix}").write_bytes(bytes(8) if binary else b"")
     model, images = pycolmap.Reconstruction(), []
     for name in names:
         _say(stage=name, total=1)
         path = (work / name).replace(folder / name)
-        given = _length(path)
+        length = _length(path)
         if binary:
             with path.open("ab") as file:
                 file.write(_PADDING)
         (model.read_binary if binary else model.read_text)(folder)
         (model.write_binary if binary else model.write_text)(again)
         understood = _length(again / name)
-        if given != understood:
+        if length != understood:
             unit = "bytes" if binary else "words (names with blanks need .bin files)"
-            raise ValueError(f"{given} {unit}, a model like it has {understood}")
+            raise ValueError(f"{length} {unit}, a model like it has {understood}")
         images = [_placed(image) for image in model.images.values()]
     points = [model.points3D[i].xyz for i in sorted(model.points3D)]
     np.save(work / POINTS, np.array(points, np.float64).reshape(-1, 3))
@@ -163,16 +163,16 @@ def _reconstruct(
     _assume_fisheye(pycolmap, database)
     _match(pycolmap, database, task["matching"], count)
     models = _map(pycolmap, database, folder, task)
-    found = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
-    if found is None:
+    model = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
+    if model is None:
         return None
-    found = _with_principal_points(pycolmap, found)
+    model = _with_principal_points(pycolmap, model)
     with pycolmap.Database.open(database) as table:
         features = {
             image.name: table.num_keypoints_for_image(image.image_id)
             for image in table.read_all_images()
         }
-    return {**_summary(found), "features": features}
+    return {**_summary(model), "features": features}
 
 
 def _assume_fisheye(pycolmap: Any, database: Path) -> None:
@@ -233,7 +233,7 @@ def _with_principal_points(pycolmap: Any, model: Any) -> Any:
 
     COLMAP leaves them in the middle of the image, and a lens that sits beside it seems
     a turn of the camera. They are let go once all else is known, of cameras with many
-    photographs; where one of them is not told to `_TOLD_SD` of the longer edge, as
+    photographs; where one of them is not told to `_MOST_SD` of the longer edge, as
     when a camera looks and moves one way, all stay where they were.
     """
     images = model.reg_image_ids()
@@ -253,23 +253,25 @@ def _with_principal_points(pycolmap: Any, model: Any) -> Any:
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, moved)
     adjuster.solve()
     moved.update_point_3d_errors()
-    told = pycolmap.estimate_ba_covariance(
+    covariances = pycolmap.estimate_ba_covariance(
         pycolmap.BACovarianceOptions(), moved, adjuster
     )
     error_px = moved.compute_mean_reprojection_error()
     cameras = (moved.cameras[i] for i in many)
-    if told and all(_is_told(told, camera, error_px) for camera in cameras):
+    if covariances and all(
+        _is_determined(covariances, camera, error_px) for camera in cameras
+    ):
         return moved
     return model
 
 
-def _is_told(told: Any, camera: Any, error_px: float) -> bool:
+def _is_determined(covariances: Any, camera: Any, error_px: float) -> bool:
     """Whether a covariance, of errors of 1 px, tells a camera's principal point."""
-    covariance = told.get_other_params_cov(camera.params)
+    covariance = covariances.get_other_params_cov(camera.params)
     if covariance is None:
         return False
     variances = np.diag(covariance)[list(camera.principal_point_idxs())]
-    most = _TOLD_SD * max(camera.width, camera.height)
+    most = _MOST_SD * max(camera.width, camera.height)
     return bool(error_px * np.sqrt(variances.max()) <= most)
 
 
@@ -279,7 +281,7 @@ def _summary(model: Any) -> dict[str, Any]:
         (model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name
     )
     poses = [image.cam_from_world().inverse().matrix().tolist() for image in images]
-    seen = [
+    point_errors = [
         [model.points3D[p.point3D_id].error for p in image.points2D if p.has_point3D()]
         for image in images
     ]
@@ -294,8 +296,8 @@ def _summary(model: Any) -> dict[str, Any]:
         "cameras": _cameras(model),
         "camera_ids": [image.camera_id for image in images],
         "points": points,
-        "points_seen": [len(errors) for errors in seen],
-        "errors_px": [sum(errors) / max(1, len(errors)) for errors in seen],
+        "points_seen": [len(errors) for errors in point_errors],
+        "errors_px": [sum(errors) / max(1, len(errors)) for errors in point_errors],
         "error_px": model.compute_mean_reprojection_error(),
     }
 

@@ -97,23 +97,24 @@ def reconstruct(
             "reconstruct with COLMAP elsewhere and give the model to 'fit'"
         )
     stages.end()
-    found = json.loads((work / RESULT).read_text(encoding="utf-8"))
-    return _structure(found, sum(map(len, groups)))
+    structure = json.loads((work / RESULT).read_text(encoding="utf-8"))
+    return _structure(structure, sum(map(len, groups)))
 
 
-def _structure(found: dict[str, Any] | None, count: int) -> Structure:
-    placed = 0 if found is None else len(found["names"])
-    if found is None or placed < LEAST_IMAGES:
+def _structure(structure: dict[str, Any] | None, count: int) -> Structure:
+    placed = 0 if structure is None else len(structure["names"])
+    if structure is None or placed < LEAST_IMAGES:
         raise InputError(
             f"photographs: {placed} of {count} could be placed, at least "
             f"{LEAST_IMAGES} are needed; take them of a still scene with texture, "
             "from different places, each part of it in three photographs or more"
         )
     poses = np.tile(np.eye(4), (placed, 1, 1))
-    poses[:, :3] = found["camera_to_world"]
+    poses[:, :3] = structure["camera_to_world"]
     try:
         known = {
-            i: from_colmap(*found["cameras"][str(i)]) for i in set(found["camera_ids"])
+            i: from_colmap(*structure["cameras"][str(i)])
+            for i in set(structure["camera_ids"])
         }
     except InputError as error:
         raise InputError(
@@ -121,12 +122,12 @@ def _structure(found: dict[str, Any] | None, count: int) -> Structure:
             "one (--lens SIMPLE_RADIAL) or more photographs"
         ) from error
     return Structure(
-        tuple(found["names"]),
+        tuple(structure["names"]),
         poses,
-        tuple(known[i] for i in found["camera_ids"]),
-        np.array(found["points"], np.float64).reshape(-1, 3),
-        found["error_px"],
-        tuple(found["points_seen"]),
-        tuple(found["errors_px"]),
-        found["features"],
+        tuple(known[i] for i in structure["camera_ids"]),
+        np.array(structure["points"], np.float64).reshape(-1, 3),
+        structure["error_px"],
+        tuple(structure["points_seen"]),
+        tuple(structure["errors_px"]),
+        structure["features"],
     )

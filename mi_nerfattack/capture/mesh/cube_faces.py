@@ -154,12 +154,12 @@ def flat_share(field: GridField) -> float:
     posed, voxel = PosedField(field), _voxel(field)
     good = []
     for axes in [axes for name, axes in CUBE_FACES.items() if name != "nz"]:
-        seen, distance = _look(posed, lower, upper, axes, (_COARSE_PX, _COARSE_PX))
-        opacity, moment = seen.opacity.numpy(), seen.moment.numpy()
+        integrals, distance = _look(posed, lower, upper, axes, (_COARSE_PX, _COARSE_PX))
+        opacity, moment = integrals.opacity.numpy(), integrals.moment.numpy()
         depth = moment / np.maximum(opacity, 1e-6)
         flat = np.abs(depth - distance) < _FLAT_VOXELS * voxel
-        whole = ((opacity > 0.5) & flat).reshape(_COARSE_PX, _COARSE_PX)
-        good.append(whole[_RIM_PX:-_RIM_PX, _RIM_PX:-_RIM_PX])
+        surface = ((opacity > 0.5) & flat).reshape(_COARSE_PX, _COARSE_PX)
+        good.append(surface[_RIM_PX:-_RIM_PX, _RIM_PX:-_RIM_PX])
     return float(np.mean(good))
 
 
@@ -173,10 +173,10 @@ def _render(
     _, right, up = np.abs(np.array(axes))
     extent = upper - lower
     width, height = (max(1, round(scale * float(v @ extent))) for v in (right, up))
-    seen, _ = _look(posed, lower, upper, axes, (height, width))
+    integrals, _ = _look(posed, lower, upper, axes, (height, width))
     return straight_rgba(
-        seen.radiance.numpy().T.reshape(height, width, 3),
-        seen.opacity.numpy().reshape(height, width, 1),
+        integrals.radiance.numpy().T.reshape(height, width, 3),
+        integrals.opacity.numpy().reshape(height, width, 1),
     )
 
 
@@ -206,6 +206,6 @@ def _look(
             mi.Vector3f(*map(float, -normal)),
             jitter=half,
         )
-        seen = march(posed, rays)
-        dr.eval(seen)
-    return seen, away - 0.5 * float(abs(normal @ extent))
+        integrals = march(posed, rays)
+        dr.eval(integrals)
+    return integrals, away - 0.5 * float(abs(normal @ extent))

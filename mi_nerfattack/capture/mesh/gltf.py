@@ -160,16 +160,16 @@ def _chunks(path: Path, raw: bytes) -> tuple[bytes, bytes | None]:
             f"{path}: {len(raw)} bytes, but its header says {length}; the file is "
             "damaged or truncated, copy or export it again"
         )
-    found: list[tuple[bytes, bytes]] = []
+    chunks: list[tuple[bytes, bytes]] = []
     start = 12
     while start + 8 <= length:
         size = int.from_bytes(raw[start : start + 4], "little")
-        found.append((raw[start + 4 : start + 8], raw[start + 8 : start + 8 + size]))
+        chunks.append((raw[start + 4 : start + 8], raw[start + 8 : start + 8 + size]))
         start += 8 + size
-    if not found or found[0][0] != _JSON or start > length:
+    if not chunks or chunks[0][0] != _JSON or start > length:
         raise InputError(f"{path}: its chunks are damaged; export the mesh again")
-    is_binary = len(found) > 1 and found[1][0] == _BIN
-    return found[0][1], found[1][1] if is_binary else None
+    is_binary = len(chunks) > 1 and chunks[1][0] == _BIN
+    return chunks[0][1], chunks[1][1] if is_binary else None
 
 
 def _prepare_tree(

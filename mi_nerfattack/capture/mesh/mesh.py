@@ -90,29 +90,29 @@ class TexturedMesh:
 
     Args:
         name: for messages.
-        parts: at least one, each with at least one triangle.
+        submeshes: at least one, each with at least one triangle.
     """
 
     name: str
-    parts: tuple[MeshPart, ...]
+    submeshes: tuple[MeshPart, ...]
 
     @property
     def bounds(self) -> np.ndarray:
         """Smallest and largest coordinates, (2, 3)."""
-        used = np.concatenate([p.vertices[np.unique(p.faces)] for p in self.parts])
+        used = np.concatenate([p.vertices[np.unique(p.faces)] for p in self.submeshes])
         return np.stack([used.min(0), used.max(0)])
 
     @property
     def area(self) -> float:
         """Sum of the areas of all triangles."""
         of = load_extra("trimesh.triangles", "the area of a mesh")
-        triangles = [part.vertices[part.faces] for part in self.parts]
+        triangles = [part.vertices[part.faces] for part in self.submeshes]
         return float(of.area(np.concatenate(triangles)).sum())
 
     def placed(self, matrix: np.ndarray, offset: np.ndarray) -> TexturedMesh:
         """Apply an affine map to all parts; see `MeshPart.placed`."""
-        parts = (part.placed(matrix, offset) for part in self.parts)
-        return replace(self, parts=tuple(parts))
+        submeshes = (part.placed(matrix, offset) for part in self.submeshes)
+        return replace(self, submeshes=tuple(submeshes))
 
     def transformed(self, scale: float, offset: np.ndarray) -> TexturedMesh:
         """Return the mesh with vertices `scale * (vertices + offset)`."""
@@ -137,7 +137,7 @@ def cube_mesh(
         raise InputError(f"edge_m: {edge_m}; must be positive")
     if faces is not None and set(faces) != set(CUBE_FACES):
         raise InputError(f"faces: {sorted(faces)}; needs {', '.join(CUBE_FACES)}")
-    parts = []
+    submeshes = []
     uv = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     for name, axes in CUBE_FACES.items():
         normal, right, up = (np.array(axis, np.float64) for axis in axes)
@@ -147,8 +147,8 @@ def cube_mesh(
         if faces is not None:
             white, texture = (1.0, 1.0, 1.0), faces[name]
             part = replace(part, colour=white, uv=uv, texture=texture, wrap="clamp")
-        parts.append(part)
-    return TexturedMesh("cube", tuple(parts))
+        submeshes.append(part)
+    return TexturedMesh("cube", tuple(submeshes))
 
 
 def normalise(
@@ -179,17 +179,17 @@ def extent_scale(
     """
     if height_m is not None and longest_m is not None:
         raise InputError("height_m, longest_m: give one of them, not both")
-    for key, wanted, present in (
+    for key, size_m, present in (
         ("height_m", height_m, float(extent[2])),
         ("longest_m", longest_m, float(extent.max())),
     ):
-        if wanted is None:
+        if size_m is None:
             continue
-        if not 0 < wanted < np.inf:
-            raise InputError(f"{key}: {wanted}; must be positive")
+        if not 0 < size_m < np.inf:
+            raise InputError(f"{key}: {size_m}; must be positive")
         if present <= 0:
             raise InputError(f"{name}: has no height to scale; give its longest edge")
-        return wanted / present
+        return size_m / present
     return 1.0
 
 
@@ -205,7 +205,7 @@ def mitsuba_shapes(mesh: TexturedMesh) -> dict[str, Any]:
 
     Textures repeat; a texture's fourth channel becomes a `mask`.
     """
-    return {f"part_{i:03d}": _mitsuba_shape(p) for i, p in enumerate(mesh.parts)}
+    return {f"part_{i:03d}": _mitsuba_shape(p) for i, p in enumerate(mesh.submeshes)}
 
 
 def _mitsuba_shape(part: MeshPart) -> Any:

@@ -87,16 +87,16 @@ def load_mesh(path: str | Path, up: str | None = None) -> TexturedMesh:
             io.BytesIO(data), file_type=kind, resolver=resolver, process=False
         )
     _refuse_missing(path, resolver)
-    parts = []
+    submeshes = []
     with _as_input_error(path, resolver):
         for node in scene.graph.nodes_geometry:
             transform, name = scene.graph[node]
             geometry = scene.geometry[name]
             if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
                 part = _read_part(geometry, base_colours)
-                place = turn @ transform[:3, :3], turn @ transform[:3, 3]
-                parts.append(part.placed(*place))
-    return _checked(path, tuple(parts))
+                matrix, offset = turn @ transform[:3, :3], turn @ transform[:3, 3]
+                submeshes.append(part.placed(matrix, offset))
+    return _checked(path, tuple(submeshes))
 
 
 def up_matrix(axis: str) -> np.ndarray:
@@ -110,10 +110,10 @@ def up_matrix(axis: str) -> np.ndarray:
     return np.array(_TO_Z_UP[axis], np.float64)
 
 
-def _checked(path: Path, parts: tuple[MeshPart, ...]) -> TexturedMesh:
-    if not parts:
+def _checked(path: Path, submeshes: tuple[MeshPart, ...]) -> TexturedMesh:
+    if not submeshes:
         raise InputError(f"{path}: contains no triangle; export a triangle mesh")
-    mesh = TexturedMesh(path.name, parts)
+    mesh = TexturedMesh(path.name, submeshes)
     if not np.all(np.abs(mesh.bounds) < _FARTHEST):  # also where it is NaN
         raise InputError(f"{path}: a vertex is NaN, infinite or beyond {_FARTHEST:g}")
     require_near(path, mesh.bounds, _EXTENTS)  # of any unit: it is scaled and centred
@@ -146,12 +146,12 @@ def _recording_resolver(path: Path, chunks: Mapping[str, bytes]) -> Any:
             name = key.strip().replace("\\", "/")
             for candidate in (name, unquote(name), name.rpartition("/")[2]):
                 try:
-                    found = folder.absolute(candidate)
+                    file_path = folder.absolute(candidate)
                 except ValueError:  # outside of the folder
                     continue
-                if os.path.isfile(found):
-                    data = files.read_bytes(found, MAX_BYTES)
-                    if found.suffix.lower() == ".mtl":
+                if os.path.isfile(file_path):
+                    data = files.read_bytes(file_path, MAX_BYTES)
+                    if file_path.suffix.lower() == ".mtl":
                         return _as_utf8(data)
                     if path.suffix.lower() in (".obj", ".ply"):
                         self._check_image(key, data)

@@ -67,11 +67,11 @@ def field_surface(field: GridField) -> ColouredMesh:
     measure = load_extra("skimage.measure", "the surface of a field")
     voxel = voxel_m(field)
     solid = _solid(_voxel_opacity(field, voxel))
-    found, faces, _, _ = measure.marching_cubes(solid, _OPAQUE)
+    grid_vertices, faces, _, _ = measure.marching_cubes(solid, _OPAQUE)
     smooth = ndimage.gaussian_filter(solid, _NORMALS_OVER)
     slope = np.stack(
         [
-            ndimage.map_coordinates(along, found.T, order=1)
+            ndimage.map_coordinates(along, grid_vertices.T, order=1)
             for along in np.gradient(smooth)
         ],
         axis=1,
@@ -79,7 +79,7 @@ def field_surface(field: GridField) -> ColouredMesh:
     length = np.linalg.norm(slope, axis=1, keepdims=True)
     normals = -slope / np.maximum(length, 1e-30)
     # one ring of empty voxels lies around the box
-    vertices = field.lower + voxel * (found.astype(np.float64) - 1)
+    vertices = field.lower + voxel * (grid_vertices.astype(np.float64) - 1)
     faces = _turned_outward(vertices, faces, normals)
     colours = seen_colours(field, vertices, normals)
     return ColouredMesh(vertices, faces, normals, colours)
@@ -153,8 +153,8 @@ def inside_out(field: GridField, points: np.ndarray, normals: np.ndarray) -> np.
 def _divided(mesh: TexturedMesh, edge_m: float) -> np.ndarray:
     """Divide triangles until no edge is longer: corners (n, 3, 3), none degenerate."""
     remesh = load_extra("trimesh.remesh", "the surface of a mesh")
-    found = []
-    for part in mesh.parts:
+    triangles = []
+    for part in mesh.submeshes:
         corners = part.vertices[part.faces]
         edges = corners - np.roll(corners, 1, axis=1)
         longest = float(np.linalg.norm(edges, axis=2).max())
@@ -162,12 +162,12 @@ def _divided(mesh: TexturedMesh, edge_m: float) -> np.ndarray:
         divided = remesh.subdivide_to_size(
             part.vertices, part.faces[has_area(corners)], edge_m, max_iter=rounds
         )
-        found.append(divided[0][divided[1]])
-        if sum(map(len, found)) > _MAX_TRIANGLES:
+        triangles.append(divided[0][divided[1]])
+        if sum(map(len, triangles)) > _MAX_TRIANGLES:
             raise InputError(
                 f"{mesh.name}: more than {_MAX_TRIANGLES} triangles; simplify it"
             )
-    corners = np.concatenate(found)
+    corners = np.concatenate(triangles)
     return corners[has_area(corners)]
 
 
@@ -213,12 +213,12 @@ def seen_colours(
         eye = points[part] + _OUTSIDE * voxel * normals[part]
         origin, direction = _point(eye), mi.Vector3f(_point(-normals[part]))
         with dr.suspend_grad():
-            seen = march(posed, Rays(origin, direction, far, half))
+            integrals = march(posed, Rays(origin, direction, far, half))
             point = _point(points[part])
             _, own = field.eval(point, direction, mi.Bool(True))
-            clear = seen.opacity > _FAINT
-            weight = dr.select(clear, seen.opacity, 1)
-            colour = dr.select(clear, seen.radiance / weight, own)
+            clear = integrals.opacity > _FAINT
+            weight = dr.select(clear, integrals.opacity, 1)
+            colour = dr.select(clear, integrals.radiance / weight, own)
         result[part] = colour.numpy().T
     return result
 
@@ -269,9 +269,9 @@ def _solid(opacity: np.ndarray) -> np.ndarray:
     ndimage.label(filled, _BLOCK, output=labels)
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
-    kept = (sizes >= _SPECK * sizes.max())[labels] & filled
-    near = ndimage.binary_dilation(kept, _BLOCK)
-    solid = np.maximum(np.where(near, opacity, 0), kept)
+    bodies = (sizes >= _SPECK * sizes.max())[labels] & filled
+    near = ndimage.binary_dilation(bodies, _BLOCK)
+    solid = np.maximum(np.where(near, opacity, 0), bodies)
     return ndimage.gaussian_filter(solid, _SURFACE_OVER)
 
 

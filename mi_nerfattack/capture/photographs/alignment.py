@@ -49,9 +49,9 @@ class Scale:
 
 
 def align(
-    found: Structure,
+    structure: Structure,
     folder: Path,
-    told: float | Distance | Markers | Tracked | None,
+    scale_source: float | Distance | Markers | Tracked | None,
     progress: StageCallback = lambda stage, done, total: None,
 ) -> tuple[Structure, Scale]:
     """Scale lengths to metres, turn z up and move the origin.
@@ -61,10 +61,10 @@ def align(
     capture, axes and origin are those of the motion capture system.
 
     Args:
-        found: with poses in any frame and unit.
+        structure: with poses in any frame and unit.
         folder: of the photographs.
-        told: metres of one unit, or the distance, markers or motion capture from which
-            the scale follows; None keeps the unit.
+        scale_source: metres of one unit, or the distance, markers or motion capture
+            from which the scale follows; None keeps the unit.
         progress: called with stage, done and total.
 
     Raises:
@@ -73,33 +73,38 @@ def align(
             photograph with a known place was not placed.
         SetupError: markers need OpenCV, which is not installed.
     """
-    if isinstance(told, Markers):
-        seen = find_markers(folder, found, told, progress)
-        metres, spread = seen.scale(told.edge_m)
-        scale = Scale(metres, spread, dict(seen.views))
-        if told.flat:
-            return _on_ground(found, metres, *seen.ground()), scale
-        return upright(found, metres), scale
-    if isinstance(told, Tracked):
-        fit = fit_tracked(found, told)
+    if isinstance(scale_source, Markers):
+        markers = find_markers(folder, structure, scale_source, progress)
+        metres, spread = markers.scale(scale_source.edge_m)
+        scale = Scale(metres, spread, dict(markers.views))
+        if scale_source.flat:
+            point, normal = markers.ground()
+            return _on_ground(structure, metres, point, normal=normal), scale
+        return upright(structure, metres), scale
+    if isinstance(scale_source, Tracked):
+        fit = fit_tracked(structure, scale_source)
         moved = _transformed(
-            found, fit.scale, np.array(fit.rotation), np.array(fit.translation)
+            structure, fit.scale, np.array(fit.rotation), np.array(fit.translation)
         )
         return moved, Scale(fit.scale, tracked=fit)
-    metres = _between(found, told) if isinstance(told, Distance) else told
-    return upright(found, metres or 1.0), Scale(metres)
+    metres = (
+        _between(structure, scale_source)
+        if isinstance(scale_source, Distance)
+        else scale_source
+    )
+    return upright(structure, metres or 1.0), Scale(metres)
 
 
-def _between(found: Structure, distance: Distance) -> float:
+def _between(structure: Structure, distance: Distance) -> float:
     places = []
     for name in map(copied, (distance.first, distance.second)):
-        if name not in found.names:
+        if name not in structure.names:
             raise InputError(
-                f"distance: {name!r} is not one of the {len(found.names)} photographs "
-                f"that were placed ({', '.join(found.names[:3])}, ...); give the names "
-                "of two of them"
+                f"distance: {name!r} is not one of the {len(structure.names)} "
+                f"photographs that were placed ({', '.join(structure.names[:3])}, "
+                "...); give the names of two of them"
             )
-        places.append(found.camera_to_world[found.names.index(name), :3, 3])
+        places.append(structure.camera_to_world[structure.names.index(name), :3, 3])
     apart = float(np.linalg.norm(places[0] - places[1]))
     if apart == 0:
         raise InputError(
@@ -109,45 +114,45 @@ def _between(found: Structure, distance: Distance) -> float:
     return distance.metres / apart
 
 
-def upright(found: Structure, scale: float) -> Structure:
+def upright(structure: Structure, scale: float) -> Structure:
     """Turn z up, move the origin to the cameras' mean, and scale lengths.
 
     Raises:
         InputError: the cameras have no common up.
     """
-    poses = found.camera_to_world
+    poses = structure.camera_to_world
     up = -poses[:, :3, 1].mean(0)
     if np.linalg.norm(up) < _LEAST_UP:
         raise InputError(
             "photographs: their upward directions cancel, so that z cannot point up; "
             "turn the photographs upright first, or lay markers flat on the ground"
         )
-    return _moved(found, scale, up, poses[:, :3, 3].mean(0))
+    return _moved(structure, scale, up, poses[:, :3, 3].mean(0))
 
 
 def _on_ground(
-    found: Structure, scale: float, point: np.ndarray, normal: np.ndarray
+    structure: Structure, scale: float, point: np.ndarray, normal: np.ndarray
 ) -> Structure:
     """Make a plane z = 0, the cameras above it and their mean above the origin."""
-    centre = found.camera_to_world[:, :3, 3].mean(0)
+    centre = structure.camera_to_world[:, :3, 3].mean(0)
     height = float((centre - point) @ normal)
     return _moved(
-        found, scale, normal * np.sign(height or 1.0), centre - height * normal
+        structure, scale, normal * np.sign(height or 1.0), centre - height * normal
     )
 
 
 def _moved(
-    found: Structure, scale: float, up: np.ndarray, origin: np.ndarray
+    structure: Structure, scale: float, up: np.ndarray, origin: np.ndarray
 ) -> Structure:
     turn = Rotation.align_vectors([0.0, 0.0, 1.0], up)[0].as_matrix()  # the smallest
-    return _transformed(found, scale, turn, -scale * turn @ origin)
+    return _transformed(structure, scale, turn, -scale * turn @ origin)
 
 
 def _transformed(
-    found: Structure, scale: float, turn: np.ndarray, shift: np.ndarray
+    structure: Structure, scale: float, turn: np.ndarray, shift: np.ndarray
 ) -> Structure:
-    result = found.camera_to_world.copy()
+    result = structure.camera_to_world.copy()
     result[:, :3, :3] = turn @ result[:, :3, :3]
     result[:, :3, 3] = scale * result[:, :3, 3] @ turn.T + shift
-    points = scale * found.points @ turn.T + shift
-    return replace(found, camera_to_world=result, points=points)
+    points = scale * structure.points @ turn.T + shift
+    return replace(structure, camera_to_world=result, points=points)

@@ -64,13 +64,13 @@ class PoseOptions:
     seed: Seed = 0
 
     def __post_init__(self) -> None:
-        told = [
+        sources = [
             name
             for name in ("metres_per_unit", "distance", "markers", "tracked")
             if getattr(self, name) is not None
         ]
-        if len(told) > 1:
-            raise InputError(f"{', '.join(told)}: each tells the scale; give one")
+        if len(sources) > 1:
+            raise InputError(f"{', '.join(sources)}: each tells the scale; give one")
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class PoseEstimate:
         farthest: the two photographs that were taken farthest apart.
         distance: between these, in the unit of the poses.
         scale: how this unit was found.
-        found: poses and points as they were written.
+        structure: poses and points as they were written.
         qualities: of all photographs.
     """
 
@@ -98,7 +98,7 @@ class PoseEstimate:
     farthest: tuple[str, str]
     distance: float
     scale: Scale
-    found: Structure
+    structure: Structure
     qualities: tuple[Quality, ...]
 
 
@@ -147,7 +147,7 @@ def estimate_poses(
         names = sorted(name for group in groups.values() for name in group)
         if options.masks is not None:
             stage_masks(options.masks, staged, names, masks)
-        found = reconstruct(
+        structure = reconstruct(
             staged,
             list(groups.values()),
             work,
@@ -158,23 +158,23 @@ def estimate_poses(
             progress,
             None if options.masks is None else masks,
         )
-        told = options.markers or options.tracked
-        told = told or options.distance or options.metres_per_unit
-        found, scale = align(found, staged, told, progress)
-        return _write(Path(output), staged, masks, found, names, scale)
+        scale_source = options.markers or options.tracked
+        scale_source = scale_source or options.distance or options.metres_per_unit
+        structure, scale = align(structure, staged, scale_source, progress)
+        return _write(Path(output), staged, masks, structure, names, scale)
 
 
 def _write(
     output: Path,
     staged: Path,
     masks: Path,
-    found: Structure,
+    structure: Structure,
     names: Sequence[str],
     scale: Scale,
 ) -> PoseEstimate:
     path = begin_posed(output)
     masked = {}
-    for name in found.names:
+    for name in structure.names:
         raw = files.read_bytes(staged / name, files.MAX_IMAGE_BYTES)
         files.write_bytes(output / "images" / name, raw)
         mask = masks / (name + SUFFIX)
@@ -184,34 +184,34 @@ def _write(
             files.write_bytes(output / "masks" / mask.name, raw)
             masked[f"images/{name}"] = f"masks/{mask.name}"
     files.write_safetensors(
-        output / "points.safetensors", {"points": found.points.astype(np.float32)}
+        output / "points.safetensors", {"points": structure.points.astype(np.float32)}
     )
-    left_out = tuple(name for name in names if name not in set(found.names))
+    left_out = tuple(name for name in names if name not in set(structure.names))
     units = "arbitrary" if scale.metres_per_unit is None else "metre"
-    qualities = assess(staged, names, found)
-    table = quality_table(found, qualities, asdict(scale))
+    qualities = assess(staged, names, structure)
+    table = quality_table(structure, qualities, asdict(scale))
     files.write_json(output / "capture.json", table)
     extra = {
         "units": units,
         "points_file": "points.safetensors",
-        "reprojection_error_px": found.error_px,
+        "reprojection_error_px": structure.error_px,
         "left_out": list(left_out),
     }
-    stored = [f"images/{name}" for name in found.names]
-    poses = found.camera_to_world
-    write_poses(path, stored, found.cameras, poses, extra, masks=masked)
+    stored = [f"images/{name}" for name in structure.names]
+    poses = structure.camera_to_world
+    write_poses(path, stored, structure.cameras, poses, extra, masks=masked)
     eyes = poses[:, :3, 3]
     apart = np.linalg.norm(eyes[:, None] - eyes[None], axis=2)
     a, b = np.unravel_index(int(apart.argmax()), apart.shape)
     return PoseEstimate(
         path,
-        found.names,
+        structure.names,
         left_out,
-        found.cameras,
-        found.error_px,
-        (found.names[a], found.names[b]),
+        structure.cameras,
+        structure.error_px,
+        (structure.names[a], structure.names[b]),
         float(apart[a, b]),
         scale,
-        found,
+        structure,
         qualities,
     )

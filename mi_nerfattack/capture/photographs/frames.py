@@ -74,34 +74,34 @@ def choose_frames(motion: Motion, options: FrameOptions) -> list[int]:
         indices, increasing.
     """
     baseline = options.baseline
-    found = _spaced(motion, baseline)
-    while len(found) > options.frames:
+    indices = _spaced(motion, baseline)
+    while len(indices) > options.frames:
         baseline *= _RATIO
-        found = _spaced(motion, baseline)
+        indices = _spaced(motion, baseline)
     few, finest = min(_FEW, options.frames), _FINEST * options.baseline
-    while len(found) < few and baseline > finest:
+    while len(indices) < few and baseline > finest:
         baseline /= _RATIO
         finer = _spaced(motion, baseline)
         if len(finer) > options.frames:
             break
-        found = finer
-    return found
+        indices = finer
+    return indices
 
 
 def _spaced(motion: Motion, baseline: float) -> list[int]:
-    found: list[int] = []
+    indices: list[int] = []
     start = 0
     while True:  # each of them is later, as its place is not the last one's
-        near = 1 - _SLACK if found else 0.0
+        near = 1 - _SLACK if indices else 0.0
         moved = _moved_from(motion, start, baseline, near + 2 * _SLACK)
         is_beyond = moved[-1] > near + 2 * _SLACK
-        if found and not is_beyond:
-            return found
+        if indices and not is_beyond:
+            return indices
         first = int(np.flatnonzero(moved >= near)[0])
         end = len(moved) - 1 if is_beyond else len(moved)
         window = np.arange(first, max(end, first + 1))
         start += int(window[motion.sharpness[start + window].argmax()])
-        found.append(start)
+        indices.append(start)
 
 
 def _moved_from(
@@ -112,7 +112,7 @@ def _moved_from(
     Up to the first beyond a limit, or to the film's end; looked for in windows that
     grow, so that short baselines in a long film do not each cost the whole of it.
     """
-    parts, at, length = [], start, _WINDOW
+    distances, at, length = [], start, _WINDOW
     while at < len(motion.place):
         away = np.linalg.norm(
             motion.place[at : at + length] - motion.place[start], axis=2
@@ -120,11 +120,11 @@ def _moved_from(
         moved = np.percentile(away, _MOVING, axis=1) / baseline
         beyond = np.flatnonzero(moved > limit)
         if len(beyond):
-            parts.append(moved[: beyond[0] + 1])
+            distances.append(moved[: beyond[0] + 1])
             break
-        parts.append(moved)
+        distances.append(moved)
         at, length = at + length, 2 * length
-    return np.concatenate(parts)
+    return np.concatenate(distances)
 
 
 def measure_motion(
@@ -226,9 +226,9 @@ def extract_frames(
 
 
 def _pick(path: Path, raw: bytes, chosen: Sequence[int]) -> Iterator[Any]:
-    wanted = set(chosen)
+    indices = set(chosen)
     for index, (frame, _) in enumerate(decode_video(path, raw)):
-        if index in wanted:
+        if index in indices:
             yield frame
         if index >= chosen[-1]:
             return

@@ -97,13 +97,14 @@ class FoundMarkers:
         ratios = {marker: edge / median for marker, edge in edges.items()}
         wrong = [marker for marker, ratio in ratios.items() if abs(ratio - 1) > _SAME]
         if wrong:
-            told = ", ".join(
+            wrong_edges = ", ".join(
                 f"{marker}: {edge_m * ratios[marker]:.4g} m"
                 for marker in wrong[:_NAMED]
             )
             raise InputError(
-                f"markers: if most edges are {edge_m} m, some are not ({told}); print "
-                "all of one size, each id once, or leave the others out of the scene"
+                f"markers: if most edges are {edge_m} m, some are not ({wrong_edges}); "
+                "print all of one size, each id once, or leave the others out of the "
+                "scene"
             )
         spread = float(np.std(list(ratios.values())))
         return edge_m / median, spread
@@ -129,7 +130,7 @@ class FoundMarkers:
 
 def find_markers(
     folder: Path,
-    found: Structure,
+    structure: Structure,
     markers: Markers,
     progress: StageCallback = lambda stage, done, total: None,
 ) -> FoundMarkers:
@@ -140,7 +141,7 @@ def find_markers(
 
     Args:
         folder: of the photographs.
-        found: their poses and cameras.
+        structure: their poses and cameras.
         markers: what to look for.
         progress: called with stage, done and total.
 
@@ -148,27 +149,27 @@ def find_markers(
         InputError: no marker is seen in two photographs or more, from places apart.
         SetupError: OpenCV is not installed.
     """
-    seen: dict[int, list[tuple[int, np.ndarray]]] = {}
-    for index, name in enumerate(found.names):
-        progress("markers", index, len(found.names))
+    detections: dict[int, list[tuple[int, np.ndarray]]] = {}
+    for index, name in enumerate(structure.names):
+        progress("markers", index, len(structure.names))
         grey = files.read_image(folder / name)[..., :3].mean(2).astype(np.uint8)
         for marker, pixels in detect_markers(grey, markers.family).items():
-            seen.setdefault(marker, []).append((index, pixels))
-    progress("markers", len(found.names), len(found.names))
+            detections.setdefault(marker, []).append((index, pixels))
+    progress("markers", len(structure.names), len(structure.names))
     corners, views = {}, {}
-    for marker, sightings in sorted(seen.items()):
+    for marker, sightings in sorted(detections.items()):
         at = [
-            _meet(found, [(index, pixels[k]) for index, pixels in sightings])
+            _meet(structure, [(index, pixels[k]) for index, pixels in sightings])
             for k in range(4)
         ]
         if all(point is not None for point in at):
             corners[marker], views[marker] = np.array(at), len(sightings)
     if not corners:
-        shown = sum(map(len, seen.values()))
+        shown = sum(map(len, detections.values()))
         raise InputError(
-            f"markers: {shown} seen of {markers.family} in {len(found.names)} placed "
-            "photographs, none in two from places apart; check the family, and let "
-            "each marker be large and sharp, with a white border, in 3 photographs"
+            f"markers: {shown} seen of {markers.family} in {len(structure.names)} "
+            "placed photographs, none in two from places apart; check the family, and "
+            "let each marker be large and sharp, with a white border, in 3 photographs"
         )
     return FoundMarkers(corners, views)
 
@@ -188,22 +189,22 @@ def detect_markers(grey: np.ndarray, family: str) -> dict[int, np.ndarray]:
     corners, ids, _ = detector.detectMarkers(np.ascontiguousarray(grey))
     numbers = [] if ids is None else np.ravel(ids).tolist()
     # OpenCV counts from the centre of the first pixel
-    found = [np.reshape(each, (4, 2)).astype(float) + 0.5 for each in corners]
+    quads = [np.reshape(each, (4, 2)).astype(float) + 0.5 for each in corners]
     return {
         marker: pixels
-        for marker, pixels in zip(numbers, found, strict=True)
+        for marker, pixels in zip(numbers, quads, strict=True)
         if numbers.count(marker) == 1
     }
 
 
 def _meet(
-    found: Structure, sightings: Iterable[tuple[int, np.ndarray]]
+    structure: Structure, sightings: Iterable[tuple[int, np.ndarray]]
 ) -> np.ndarray | None:
     """Return the point (3,) that photographs show at pixels; None without depth."""
     indices = [index for index, _ in sightings]
     pixels = np.array([pixel for _, pixel in sightings])
-    cameras = [found.cameras[index] for index in indices]
-    poses = found.camera_to_world[indices]
+    cameras = [structure.cameras[index] for index in indices]
+    poses = structure.camera_to_world[indices]
     rays = np.stack(
         [
             pose[:3, :3] @ _ray(camera, pixel)

@@ -72,27 +72,31 @@ class Quality:
         ]
 
 
-def assess(folder: Path, names: Sequence[str], found: Structure) -> tuple[Quality, ...]:
+def assess(
+    folder: Path, names: Sequence[str], structure: Structure
+) -> tuple[Quality, ...]:
     """Tell what photographs gave to a reconstruction.
 
     Args:
         folder: of the photographs.
         names: of all of them, in order.
-        found: what came of them.
+        structure: what came of them.
     """
     sharpness = np.array([_sharpness_of(folder / name) for name in names])
-    gaps = view_gaps(found.cameras, found.camera_to_world, found.points).tolist()
-    of_each = zip(found.points_seen, found.errors_px, gaps, strict=True)
-    seen = dict(zip(found.names, of_each, strict=True))
+    gaps = view_gaps(
+        structure.cameras, structure.camera_to_world, structure.points
+    ).tolist()
+    of_each = zip(structure.points_seen, structure.errors_px, gaps, strict=True)
+    measures = dict(zip(structure.names, of_each, strict=True))
     result = []
     for i, name in enumerate(names):
         near = sharpness[max(0, i - _NEIGHBOURS) : i + _NEIGHBOURS + 1]
         median = float(np.median(near))
-        points, error, gap = seen.get(name, (0, None, None))
+        points, error, gap = measures.get(name, (0, None, None))
         relative = float(sharpness[i]) / median if median > 0 else 1.0
-        features = found.features.get(name, 0)
+        features = structure.features.get(name, 0)
         result.append(
-            Quality(name, name in seen, features, points, error, relative, gap)
+            Quality(name, name in measures, features, points, error, relative, gap)
         )
     return tuple(result)
 
@@ -116,7 +120,7 @@ def median_gap(qualities: Sequence[Quality]) -> float | None:
 
 
 def quality_table(
-    found: Structure, qualities: Sequence[Quality], scale: Mapping[str, Any]
+    structure: Structure, qualities: Sequence[Quality], scale: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Return what `capture.json` holds."""
     placed = sum(quality.placed for quality in qualities)
@@ -124,9 +128,9 @@ def quality_table(
         "photographs": len(qualities),
         "placed": placed,
         "placed_share": placed / len(qualities),
-        "reprojection_error_px": found.error_px,
-        "cameras": len(set(found.cameras)),
-        "points": len(found.points),
+        "reprojection_error_px": structure.error_px,
+        "cameras": len(set(structure.cameras)),
+        "points": len(structure.points),
         "gap_deg": median_gap(qualities),
         "scale": dict(scale),
         "retake": retake(qualities),

@@ -38,12 +38,14 @@ class HeldCamera(NamedTuple):
     height: int
 
     def __str__(self) -> str:
-        parts = [" ".join((self.make, self.model)).strip()]
-        parts += [f"{self.focal_mm} mm"] * bool(self.focal_mm)
-        parts += [f"zoom {self.zoom}"] * bool(self.zoom)
-        parts += [f"{self.width} x {self.height} px"]
-        parts += [f"turned by EXIF data ({self.orientation})"] * (self.orientation != 1)
-        return ", ".join(part for part in parts if part)
+        fields = [" ".join((self.make, self.model)).strip()]
+        fields += [f"{self.focal_mm} mm"] * bool(self.focal_mm)
+        fields += [f"zoom {self.zoom}"] * bool(self.zoom)
+        fields += [f"{self.width} x {self.height} px"]
+        fields += [f"turned by EXIF data ({self.orientation})"] * (
+            self.orientation != 1
+        )
+        return ", ".join(field for field in fields if field)
 
 
 def list_photographs(root: Path) -> list[str]:
@@ -114,8 +116,8 @@ def check_groups(root: Path, groups: Mapping[HeldCamera, Sequence[str]]) -> None
 
 
 def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _SHOWN} more" * (len(names) > _SHOWN)
-    return ", ".join(names[:_SHOWN]) + more
+    suffix = f" and {len(names) - _SHOWN} more" * (len(names) > _SHOWN)
+    return ", ".join(names[:_SHOWN]) + suffix
 
 
 def check_in_place(root: Path, names: Sequence[str], staged: Path, out: Path) -> None:

@@ -91,11 +91,11 @@ def read_tracked(path: Path, times: Mapping[str, float] | None = None) -> Tracke
         table.times, table.camera_to_world, np.array(list(times.values()))
     )
     named = zip(times, matrices, is_known, strict=True)
-    found = {name: pose for name, pose, known in named if known}
-    return Tracked(str(path), found)
+    poses = {name: pose for name, pose, known in named if known}
+    return Tracked(str(path), poses)
 
 
-def fit_tracked(found: Structure, tracked: Tracked) -> HandEye:
+def fit_tracked(structure: Structure, tracked: Tracked) -> HandEye:
     """Find scale, rotation and translation of a world, and the camera on the body.
 
     Let B be the pose of the body, X the camera's pose on the body, C the camera's pose
@@ -106,7 +106,7 @@ def fit_tracked(found: Structure, tracked: Tracked) -> HandEye:
     outliers count less.
 
     Args:
-        found: poses of any frame and unit.
+        structure: poses of any frame and unit.
         tracked: poses of the same photographs, or of some.
 
     Raises:
@@ -115,18 +115,20 @@ def fit_tracked(found: Structure, tracked: Tracked) -> HandEye:
 
     Source: Park and Martin 1994, robot sensor calibration; with a scale.
     """
-    shared = _shared(found, tracked)
-    body = np.stack([tracked.body_to_world[found.names[i]] for i in shared])
-    camera = found.camera_to_world[shared]
+    shared = _shared(structure, tracked)
+    body = np.stack([tracked.body_to_world[structure.names[i]] for i in shared])
+    camera = structure.camera_to_world[shared]
     turned = Rotation.from_matrix(body[:, :3, :3])
-    seen = Rotation.from_matrix(camera[:, :3, :3])
-    start = _start(tracked.where, turned, seen, body[:, :3, 3], camera[:, :3, 3])
+    camera_rotations = Rotation.from_matrix(camera[:, :3, :3])
+    start = _start(
+        tracked.where, turned, camera_rotations, body[:, :3, 3], camera[:, :3, 3]
+    )
 
     def residuals(x: np.ndarray) -> np.ndarray:
         mount, world = (Rotation.from_rotvec(v) for v in (x[:3], x[3:6]))
         there = np.exp(x[12]) * world.apply(camera[:, :3, 3]) + x[9:12]
         place = turned.apply(x[6:9]) + body[:, :3, 3] - there
-        turn = (turned * mount * (world * seen).inv()).as_rotvec()
+        turn = (turned * mount * (world * camera_rotations).inv()).as_rotvec()
         return np.concatenate([place.ravel(), turn.ravel()])
 
     fit = least_squares(residuals, start, loss="soft_l1", f_scale=_OUTLIER)
@@ -154,14 +156,14 @@ def fit_tracked(found: Structure, tracked: Tracked) -> HandEye:
     )
 
 
-def _shared(found: Structure, tracked: Tracked) -> list[int]:
+def _shared(structure: Structure, tracked: Tracked) -> list[int]:
     """Return the indices of the photographs that have both poses."""
-    shared = [i for i, n in enumerate(found.names) if n in tracked.body_to_world]
+    shared = [i for i, n in enumerate(structure.names) if n in tracked.body_to_world]
     if len(shared) < _LEAST:
         raise InputError(
-            f"{tracked.where}: has poses of {len(shared)} of {len(found.names)} placed "
-            f"photographs, at least {_LEAST} are needed; see that names, or the clocks "
-            "of the video and the tracker, agree"
+            f"{tracked.where}: has poses of {len(shared)} of {len(structure.names)} "
+            f"placed photographs, at least {_LEAST} are needed; see that names, or the "
+            "clocks of the video and the tracker, agree"
         )
     return shared
 
@@ -169,22 +171,22 @@ def _shared(found: Structure, tracked: Tracked) -> list[int]:
 def _start(
     where: str,
     turned: Any,
-    seen: Any,
+    camera_rotations: Any,
     places: np.ndarray,
-    seen_places: np.ndarray,
+    camera_places: np.ndarray,
 ) -> np.ndarray:
     """Return rotation vectors of X and W, X's and W's translation, and log scale.
 
     Args:
         where: for messages.
         turned: n rotations of B; `Any`, as SciPy's stubs index with one integer alone.
-        seen: n rotations of C.
+        camera_rotations: n rotations of C.
         places: (n, 3), of B, metres.
-        seen_places: (n, 3), of C, units.
+        camera_places: (n, 3), of C, units.
     """
     first, second = np.triu_indices(len(places), 1)
     by_body = (turned[first].inv() * turned[second]).as_rotvec()
-    by_camera = (seen[first].inv() * seen[second]).as_rotvec()
+    by_camera = (camera_rotations[first].inv() * camera_rotations[second]).as_rotvec()
     is_sure = np.linalg.norm(by_body, axis=1) < _LARGEST_TURN
     by_body, by_camera = by_body[is_sure], by_camera[is_sure]
     spread = np.linalg.svd(by_body, compute_uv=False) / np.sqrt(max(1, len(by_body)))
@@ -194,12 +196,12 @@ def _start(
             "where it is on the body; tilt or roll it while filming, too"
         )
     mount = Rotation.align_vectors(by_body, by_camera)[0]
-    world = (turned * mount * seen.inv()).mean()
+    world = (turned * mount * camera_rotations.inv()).mean()
     n = len(places)
     system = np.zeros((n, 3, 7))
     system[:, :, :3] = turned.as_matrix()
     system[:, :, 3:6] = -np.eye(3)
-    system[:, :, 6] = -world.apply(seen_places)
+    system[:, :, 6] = -world.apply(camera_places)
     solution = np.linalg.lstsq(system.reshape(-1, 7), -places.ravel(), rcond=None)[0]
     if not solution[6] > 0:
         raise InputError(

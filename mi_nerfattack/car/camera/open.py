@@ -75,8 +75,8 @@ def open_camera(
         InputError: it names none, or one that cannot be opened.
         SetupError: a package is not installed.
     """
-    kind, _, rest = text.partition(":")
-    if kind not in ("zed", "v4l", "video") or not rest:
+    kind, _, source = text.partition(":")
+    if kind not in ("zed", "v4l", "video") or not source:
         raise InputError(f"camera {text!r}: must be {FORMS}")
     prepare: AbstractPreparation
     if kind == "zed" or (kind == "video" and zed is not None):
@@ -86,16 +86,16 @@ def open_camera(
     else:
         raise InputError(f"camera {text!r}: no intrinsics; give those of its frames")
     if kind == "video":
-        return VideoCamera(Path(rest), prepare, clock, is_looped)
-    return V4lCamera(rest, prepare, fps, clock)
+        return VideoCamera(Path(source), prepare, clock, is_looped)
+    return V4lCamera(source, prepare, fps, clock)
 
 
 def _only_calibration() -> Path:
-    found = sorted(SETTINGS.glob("SN*.conf"))
-    if len(found) != 1:
-        names = ", ".join(path.name for path in found) or "none"
+    paths = sorted(SETTINGS.glob("SN*.conf"))
+    if len(paths) != 1:
+        names = ", ".join(path.name for path in paths) or "none"
         raise InputError(
             f"ZED: no calibration named; {SETTINGS} has {names}: name the file of the "
             "serial number, from http://calib.stereolabs.com/?SN=SERIAL"
         )
-    return found[0]
+    return paths[0]

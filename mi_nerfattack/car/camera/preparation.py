@@ -53,5 +53,7 @@ def check_size(
 ) -> None:
     """Raise InputError, with `where`, if a device gives frames of another size."""
     if (width, height) != prepare.source_px:
-        wanted = " x ".join(map(str, prepare.source_px))
-        raise InputError(f"{where}: frames of {width} x {height} px; needs {wanted} px")
+        expected = " x ".join(map(str, prepare.source_px))
+        raise InputError(
+            f"{where}: frames of {width} x {height} px; needs {expected} px"
+        )

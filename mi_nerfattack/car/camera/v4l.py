@@ -78,9 +78,9 @@ class V4lCamera(AbstractCamera):
             raise DeviceLostError(f"{self._device}: {self._error}")
         with self._lock:
             if self._unprepared is not None:
-                found, time_s, index = self._unprepared
+                frame, time_s, index = self._unprepared
                 self._unprepared = None
-                image = self._prepare.apply(found.to_ndarray(format="rgb24"))
+                image = self._prepare.apply(frame.to_ndarray(format="rgb24"))
                 self._frame = Frame(image, time_s, index)
             return self._frame
 

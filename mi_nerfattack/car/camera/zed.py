@@ -67,16 +67,16 @@ class EyeCalibration:
             InputError: a size that is none, or a distortion that no camera of a scene
                 can have.
         """
-        whole = self.pinhole
-        width, height = size_px or (whole.width // 2, whole.height // 2)
-        if not (0 < width <= whole.width and 0 < height <= whole.height):
+        pinhole = self.pinhole
+        width, height = size_px or (pinhole.width // 2, pinhole.height // 2)
+        if not (0 < width <= pinhole.width and 0 < height <= pinhole.height):
             raise InputError(
-                f"ZED: {width} x {height} px; from 1 x 1 to {whole.width} x "
-                f"{whole.height} px"
+                f"ZED: {width} x {height} px; from 1 x 1 to {pinhole.width} x "
+                f"{pinhole.height} px"
             )
-        found = whole.resized(width, height)
+        camera = pinhole.resized(width, height)
         if is_undistorted:
-            return found
+            return camera
         lens = dict(zip(_LENS, self.distortion, strict=False))
         for name in _LENS[4:]:
             if value := lens.pop(name, 0.0):
@@ -85,7 +85,7 @@ class EyeCalibration:
                     "p1, p2 alone: take the distortion out"
                 )
         try:
-            return replace(found, **lens)
+            return replace(camera, **lens)
         except InputError as error:
             raise InputError(f"{self.where}: {error}") from error
 
@@ -186,21 +186,23 @@ class LeftEye(AbstractPreparation):
 
     def __init__(self, eye: EyeCalibration, camera: Camera) -> None:
         self._cv2 = load_extra("cv2", "a ZED")
-        whole = eye.pinhole
-        self.source_px = 2 * whole.width, whole.height
+        pinhole = eye.pinhole
+        self.source_px = 2 * pinhole.width, pinhole.height
         self.camera = camera
         self._reduced_px = (
-            min(whole.width, max(1, round(whole.width * camera.fx / whole.fx))),
-            min(whole.height, max(1, round(whole.height * camera.fy / whole.fy))),
+            min(pinhole.width, max(1, round(pinhole.width * camera.fx / pinhole.fx))),
+            min(pinhole.height, max(1, round(pinhole.height * camera.fy / pinhole.fy))),
         )
-        self._maps = self._places(eye)
+        self._columns, self._rows = self._places(eye)
 
     def apply(self, image: np.ndarray) -> np.ndarray:
         """Return what the camera sees."""
         cv2 = self._cv2
         left = np.ascontiguousarray(image[:, : image.shape[1] // 2])
         reduced = cv2.resize(left, self._reduced_px, interpolation=cv2.INTER_AREA)
-        return cv2.remap(reduced, *self._maps, cv2.INTER_LINEAR)
+        return cv2.remap(
+            reduced, self._columns, self._rows, interpolation=cv2.INTER_LINEAR
+        )
 
     def _places(self, eye: EyeCalibration) -> tuple[np.ndarray, np.ndarray]:
         """Return the column and the row (h, w) of the reduced picture of each pixel."""

@@ -20,7 +20,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.io.overrides import set_keys
 from mi_nerfattack.io.strict import parse_toml
-from mi_nerfattack.ranges import Acute, Count, NonNegative, Positive, Seconds, Whole
+from mi_nerfattack.ranges import Acute, Count, Natural, NonNegative, Positive, Seconds
 from mi_nerfattack.scenario.section import Section, read_section
 from mi_nerfattack.scenes import bundled
 from mi_nerfattack.vehicle.route.route import Route
@@ -64,7 +64,7 @@ class DriveConfig(Section):
     port: str = "/dev/ttyACM0"
     calibration: str | None = None
     enable: str = "/dev/input/js0"
-    button: Whole = 5
+    button: Natural = 5
     silence_s: Seconds | None = None
     fence: str | None = None
     margin_m: NonNegative = 0.5
@@ -105,8 +105,8 @@ class DriveConfig(Section):
             InputError: a key has another value than the policy's file, or neither of
                 them gives the unit.
         """
-        found = {"control_unit": unit, "wheelbase_m": wheelbase_m}
-        said = {key: value for key, value in found.items() if value is not None}
+        policy_values = {"control_unit": unit, "wheelbase_m": wheelbase_m}
+        said = {key: value for key, value in policy_values.items() if value is not None}
         for key, value in said.items():
             if key in self.model_fields_set and getattr(self, key) != value:
                 raise InputError(
@@ -158,15 +158,15 @@ class DriveConfig(Section):
     def read_route(self) -> Route:
         """Read the route, at the speed that is driven."""
         path = self.routes_file or bundled("room/routes.json")
-        found = Route.from_file(path, self.route)
-        speed = self.speed_ms or found.speed_ms
+        route = Route.from_file(path, self.route)
+        speed = self.speed_ms or route.speed_ms
         return Route(
-            found.name,
-            found.goal,
-            found.points,
-            found.lane_width_m,
+            route.name,
+            route.goal,
+            route.points,
+            route.lane_width_m,
             min(speed, self.max_speed_ms),
-            found.closed,
+            route.closed,
         )
 
     def settings(self, route: Route) -> DriveSettings:
@@ -241,13 +241,13 @@ class DriveConfig(Section):
 
 
 def read_config(
-    path: Path | None, given: Mapping[str, Any], settings: Sequence[str] = ()
+    path: Path | None, options: Mapping[str, Any], settings: Sequence[str] = ()
 ) -> DriveConfig:
     """Read a configuration.
 
     Args:
         path: TOML file, whose paths start from its folder; None without one.
-        given: options of the command line; these come first, None is not given.
+        options: of the command line; these come first, None is not given.
         settings: keys that replace those of the file, see `overrides.set_keys`; their
             paths start from the working folder.
 
@@ -267,7 +267,7 @@ def read_config(
         if isinstance(policy, str) and (path.parent / policy).is_file():
             values["policy"] = str(path.parent / policy)
     name = "drive" if path is None else str(path)
-    chosen = {key: value for key, value in given.items() if value is not None}
+    chosen = {key: value for key, value in options.items() if value is not None}
     replaced = parse_toml(name, set_keys(name, "", settings))
     for key in replaced.keys() & chosen.keys():
         raise InputError(

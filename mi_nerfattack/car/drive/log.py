@@ -126,7 +126,7 @@ class DriveLog:
         camera: intrinsics of the frames.
         clock: of the loop.
         wall_ns: wall time at this moment, nanoseconds since 1970.
-        about: of the drive: texts by name.
+        description: of the drive: texts by name.
 
     Attributes:
         counts: messages written, by topic.
@@ -142,7 +142,7 @@ class DriveLog:
         camera: Camera,
         clock: Clock,
         wall_ns: int,
-        about: Mapping[str, str],
+        description: Mapping[str, str],
     ) -> None:
         library = load_extra("mcap_ros2.writer", "the log of a drive")
         kinds = load_extra("mcap.writer", "the log of a drive").CompressionType
@@ -156,7 +156,7 @@ class DriveLog:
         }
         clocks = {"monotonic_s": repr(self._start_s), "wall_ns": str(wall_ns)}
         self._writer.add_metadata("clocks", clocks)
-        self._writer.add_metadata("drive", dict(about))
+        self._writer.add_metadata("drive", dict(description))
         self._add("/camera/camera_info", clock(), _camera_info(camera))
 
     def frame(self, frame: Frame) -> None:
@@ -177,7 +177,7 @@ class DriveLog:
         self._add("/vehicle/pose", pose.time_s, {"pose": place})
 
     def command(
-        self, time_s: float, decision: Decision, wanted: Command, sent: Command
+        self, time_s: float, decision: Decision, request: Command, sent: Command
     ) -> None:
         """Write what was asked for and what was sent."""
         made = {
@@ -186,7 +186,7 @@ class DriveLog:
             "decided_s": decision.time_s,
             "control": decision.control,
         }
-        self._command(time_s, made, wanted, sent, brake=False)
+        self._command(time_s, made, request, sent, brake=False)
 
     def brake(self, time_s: float) -> None:
         """Write that the car was braked and its wheels centred."""
@@ -198,7 +198,7 @@ class DriveLog:
         self,
         time_s: float,
         made: dict[str, Any],
-        wanted: Command,
+        request: Command,
         sent: Command,
         brake: bool,
     ) -> None:
@@ -206,8 +206,8 @@ class DriveLog:
         unused = dict.fromkeys(("steering_angle_velocity", "acceleration", "jerk"), 0.0)
         self._add("/command", time_s, {"drive": drive | unused})
         asked = {
-            "asked_speed_ms": wanted.speed_ms,
-            "asked_steering_rad": wanted.steering_rad,
+            "asked_speed_ms": request.speed_ms,
+            "asked_steering_rad": request.steering_rad,
         }
         self._add("/decision", time_s, {**made, **asked, "brake": brake})
 

@@ -71,7 +71,7 @@ class DriveSettings:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Readings:
     """What the devices said in one round."""
 
     now_s: float
@@ -142,37 +142,37 @@ class DriveLoop:
         try:
             try:
                 self._wait(interrupted)
-                found = self._drive(interrupted)
+                ending = self._drive(interrupted)
             finally:
                 self._brake()
         except Stop as stop:
-            found = stop
+            ending = stop
         except KeyboardInterrupt:
-            found = Stop(Cause.INTERRUPTED, "by a signal, as Ctrl-C is")
+            ending = Stop(Cause.INTERRUPTED, "by a signal, as Ctrl-C is")
         except Exception as error:
-            found = Stop(Cause.EXCEPTION, f"{type(error).__name__}: {error}")
-            found.__cause__ = error
-        self._come_to_rest(found)
-        return found
+            ending = Stop(Cause.EXCEPTION, f"{type(error).__name__}: {error}")
+            ending.__cause__ = error
+        self._come_to_rest(ending)
+        return ending
 
     def _wait(self, interrupted: Callable[[], None]) -> None:
         """Wait until the enable is pressed anew, and nothing speaks against driving."""
-        was_released, told, is_checked = False, None, False
+        was_released, last_kind, is_checked = False, None, False
         self._rounds.begin()
         while True:
             interrupted()
-            seen = self._look()
+            readings = self._look()
             was_late = self._rounds.begin() > self._rounds.limit_s
             self._notes.clear()  # how the car stands and waits is not written
-            problem = self._problem(seen)
+            problem = self._problem(readings)
             stays = problem is None and not was_late
-            was_released = not seen.is_held or (was_released and stays)
-            is_checked = is_checked and seen.is_held and stays
+            was_released = not readings.is_held or (was_released and stays)
+            is_checked = is_checked and readings.is_held and stays
             if problem is not None:
                 state = f"not ready: {problem}"
             elif not was_released:
                 state = "ready: release the enable button, then hold it"
-            elif not seen.is_held:
+            elif not readings.is_held:
                 state = "ready: hold the enable button to drive"
             elif not is_checked:  # which takes time: judge all once more afterwards
                 asked(Cause.MOTOR_LOST, self._devices.motor.check)
@@ -186,9 +186,9 @@ class DriveLoop:
                 self._decided = self._submitted
                 return
             kind = state if problem is None else problem.cause
-            if kind != told:
+            if kind != last_kind:
                 self._say(INFO, "waiting", state)
-            told = kind
+            last_kind = kind
             self._pause()
 
     def _drive(self, interrupted: Callable[[], None]) -> Stop:
@@ -200,14 +200,14 @@ class DriveLoop:
         while True:
             self._come_round()
             interrupted()
-            seen = self._look()
-            decision = seen.decision
+            readings = self._look()
+            decision = readings.decision
             is_new = decision is not None and decision.frame_index > self._decided
-            self._judge(seen, is_new)
-            if seen.now_s >= end_s:
+            self._judge(readings, is_new)
+            if readings.now_s >= end_s:
                 return Stop(Cause.TIME_UP, f"{self._settings.duration_s:g} s")
             if decision is not None and is_new:
-                self._send(decision, seen)
+                self._send(decision, readings)
             self._pause()
 
     def _come_round(self) -> None:
@@ -215,7 +215,7 @@ class DriveLoop:
         self._longest_s = max(self._longest_s, self._rounds.check())
         self._rounds.begin()
 
-    def _look(self) -> _Seen:
+    def _look(self) -> _Readings:
         """Ask all devices, and give the pilot a frame that is due."""
         devices = self._devices
         frame = asked(Cause.CAMERA_LOST, devices.camera.newest)
@@ -230,7 +230,7 @@ class DriveLoop:
             self._notes.append(partial(self._log.frame, frame))
         decision = asked(Cause.PILOT_LOST, devices.pilot.newest)
         held = devices.enable.is_held()
-        return _Seen(self._clock(), frame, pose, values, decision, held)
+        return _Readings(self._clock(), frame, pose, values, decision, held)
 
     def _is_due(self, frame: Frame) -> bool:
         period = self._settings.judge.period_s
@@ -250,47 +250,47 @@ class DriveLoop:
             self._values_s = values.time_s
             self._notes.append(partial(self._log.motor, values))
 
-    def _check(self, seen: _Seen, first_command_s: float | None) -> None:
+    def _check(self, readings: _Readings, first_command_s: float | None) -> None:
         """Judge all that must be right, driving or not."""
         judge, settings = self._settings.judge, self._settings
-        judge.frame(seen.frame, seen.now_s)
-        judge.pose(seen.pose, seen.now_s, self._devices.tracker, settings.body)
-        judge.motor(seen.values, first_command_s)
+        judge.frame(readings.frame, readings.now_s)
+        judge.pose(readings.pose, readings.now_s, self._devices.tracker, settings.body)
+        judge.motor(readings.values, first_command_s)
 
-    def _judge(self, seen: _Seen, is_new: bool) -> None:
+    def _judge(self, readings: _Readings, is_new: bool) -> None:
         """Judge all that must be right to drive on.
 
         Args:
-            seen: in this round.
+            readings: in this round.
             is_new: whether its decision is about to be sent.
         """
         self._rounds.check()
-        if not seen.is_held:
+        if not readings.is_held:
             raise Stop(Cause.RELEASED, "or its device is gone")
-        self._check(seen, self._first_command_s)
+        self._check(readings, self._first_command_s)
         self._speeds.check()
-        self._settings.judge.decision(seen.decision, seen.now_s, is_new)
+        self._settings.judge.decision(readings.decision, readings.now_s, is_new)
 
-    def _problem(self, seen: _Seen) -> Stop | None:
+    def _problem(self, readings: _Readings) -> Stop | None:
         """Return what speaks against driving."""
         try:
-            self._check(seen, None)
-            self._settings.judge.decision(seen.decision, seen.now_s, False)
+            self._check(readings, None)
+            self._settings.judge.decision(readings.decision, readings.now_s, False)
         except Stop as stop:
             return stop
         return None
 
-    def _send(self, decision: Decision, seen: _Seen) -> None:
+    def _send(self, decision: Decision, readings: _Readings) -> None:
         """Send what a new decision asks for, as far as the limits allow."""
         settings = self._settings
-        angle = settings.steering.angle(decision.control, self._speed(seen))
-        wanted = Command(settings.speed_ms, angle)
+        angle = settings.steering.angle(decision.control, self._speed(readings))
+        request = Command(settings.speed_ms, angle)
         elapsed = min(self._clock() - self._sent_s, 2 * settings.judge.period_s)
-        allowed = settings.limits.apply(wanted, self._allowed, elapsed)
+        allowed = settings.limits.apply(request, self._allowed, elapsed)
         held = self._devices.enable.is_held()
         now = self._clock()
         # again, for this thread may have stood still since it asked
-        self._judge(replace(seen, is_held=held, now_s=now), True)
+        self._judge(replace(readings, is_held=held, now_s=now), True)
         sent = asked(Cause.MOTOR_LOST, partial(self._devices.motor.send, allowed))
         self._speeds.command(self._clock(), allowed.speed_ms)
         # not what was sent: a motor that brakes below its slowest turns never starts
@@ -298,11 +298,11 @@ class DriveLoop:
         self._sent_s, self._decided = self._clock(), decision.frame_index
         if self._first_command_s is None:
             self._first_command_s = self._sent_s
-        pose, frame = seen.pose, seen.frame
+        pose, frame = readings.pose, readings.frame
         assert pose is not None and frame is not None
         self.measures.add(self._sent_s, decision, pose)
         log, sent_s = self._log, self._sent_s
-        self._notes.append(partial(log.command, sent_s, decision, wanted, sent))
+        self._notes.append(partial(log.command, sent_s, decision, request, sent))
         ages = {
             "frame_s": now - frame.time_s,
             "pose_s": now - pose.time_s,
@@ -312,11 +312,11 @@ class DriveLoop:
         self._notes.append(partial(log.ages, now, **ages))
         self._longest_s = 0.0
 
-    def _speed(self, seen: _Seen) -> float:
+    def _speed(self, readings: _Readings) -> float:
         """Return how fast the car drives, as nearly as is known."""
         tracked = self._speeds.tracked(_NEWEST_S)
-        if tracked is None and seen.values is not None:
-            tracked = seen.values.speed_ms
+        if tracked is None and readings.values is not None:
+            tracked = readings.values.speed_ms
         return self._allowed.speed_ms if tracked is None else abs(tracked)
 
     def _pause(self) -> None:
@@ -334,12 +334,12 @@ class DriveLoop:
             return f"{type(error).__name__}: {error}"
         return None
 
-    def _come_to_rest(self, found: Stop) -> None:
+    def _come_to_rest(self, stop: Stop) -> None:
         """Write why, and brake on for a while; nothing of this fails."""
-        level = INFO if found.cause.is_planned else FATAL
+        level = INFO if stop.cause.is_planned else FATAL
         say = self._log.say
-        self._notes.append(partial(say, level, found.cause.value, found.message))
-        now, told = self._clock(), None
+        self._notes.append(partial(say, level, stop.cause.value, stop.message))
+        now, last_problem = self._clock(), None
         end, due = now + _BRAKE_FOR_S, now
         while (now := self._clock()) < end:
             if now >= due:
@@ -348,9 +348,9 @@ class DriveLoop:
                     self.was_braked = True
                     self._notes.append(partial(self._log.brake, now))
                 with suppress(Exception):  # what fails, and why, is told already
-                    if problem not in (None, told):
+                    if problem not in (None, last_problem):
                         self._say(FATAL, "brake not sent", problem)
-                told = problem
+                last_problem = problem
             with suppress(Exception):
                 self._look_on()
             self._write_what_can_be()

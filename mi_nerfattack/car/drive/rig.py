@@ -115,21 +115,21 @@ def open_rig(
         zed = ZedOptions(None if file is None else Path(file), config.zed_mode, size)
     assert config.tracker is not None  # see `DriveConfig.check`
     with ExitStack() as stack:
-        seen = open_camera(config.camera, camera, zed, clock=clock)
-        stack.callback(seen.close)
+        camera_device = open_camera(config.camera, camera, zed, clock=clock)
+        stack.callback(camera_device.close)
         tracker = open_tracker(
             config.tracker, mount, config.rotation, config.tracker_sender, clock
         )
         stack.callback(tracker.close)
         if overlaid is not None:
-            seen = overlaid(seen, tracker, mount)
+            camera_device = overlaid(camera_device, tracker, mount)
         enable = JoystickEnable(config.enable, config.button, clock, config.silence_s)
         stack.callback(enable.close)
         pilot = LocalPilot(begin_control(config, route, trained.policy, tracker), clock)
         stack.callback(pilot.close)
         motor = VescMotor(config.port, scales, confirm)
         stack.callback(motor.close)
-        devices = Devices(seen, tracker, motor, pilot, enable)
+        devices = Devices(camera_device, tracker, motor, pilot, enable)
         yield Rig(devices, clock, time.sleep, suspended_clock, trained.mount)
 
 

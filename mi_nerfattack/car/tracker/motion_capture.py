@@ -127,13 +127,13 @@ class MotionCaptureTracker(AbstractTracker):
         if not self._connection.poll(timeout_s):
             raise InputError(f"{self._where}: {late}")
         try:
-            told, text = self._connection.recv()
+            kind, text = self._connection.recv()
         except (EOFError, OSError) as error:
             self._process.join()
             if self._process.exitcode == -_ALARM:
                 raise InputError(f"{self._where}: {late}") from error
             raise InputError(f"{self._where}: {self._ended()}") from error
-        if told == "error":
+        if kind == "error":
             raise InputError(f"{self._where}: {text}")
 
     def _ended(self) -> str:
@@ -150,8 +150,8 @@ class MotionCaptureTracker(AbstractTracker):
             why = f"reading failed ({type(error).__name__}: {error})"
             self._error = self._error or why
 
-    def _take(self, told: str, content: Any) -> None:
-        if told == "error":
+    def _take(self, kind: str, content: Any) -> None:
+        if kind == "error":
             self._error = self._error or content
             return
         taken_s, bodies = content
@@ -171,13 +171,13 @@ def _package() -> Any:
 
 def _matrix(values: tuple[float, ...]) -> np.ndarray | None:
     """Return the pose (4, 4) of a body; None where it is not seen."""
-    found = np.array(values, np.float64)
-    length = float(np.linalg.norm(found[3:]))
-    if not (np.isfinite(found).all() and abs(length - 1) < _UNIT):
+    pose = np.array(values, np.float64)
+    length = float(np.linalg.norm(pose[3:]))
+    if not (np.isfinite(pose).all() and abs(length - 1) < _UNIT):
         return None
     matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat(found[3:]).as_matrix()
-    matrix[:3, 3] = found[:3]
+    matrix[:3, :3] = Rotation.from_quat(pose[3:]).as_matrix()
+    matrix[:3, 3] = pose[:3]
     return matrix
 
 
@@ -213,12 +213,12 @@ def _serve(
 
 
 def _bodies(system: Any) -> _Bodies:
-    found = {}
+    bodies = {}
     for name, body in system.rigidBodies.items():
         turn = body.rotation
         numbers = (*body.position, turn.x, turn.y, turn.z, turn.w)
-        found[str(name)] = tuple(map(float, numbers))
-    return found
+        bodies[str(name)] = tuple(map(float, numbers))
+    return bodies
 
 
 def _end_with(connection: Connection) -> None:

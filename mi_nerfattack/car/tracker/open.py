@@ -104,25 +104,25 @@ def open_tracker(
         InputError: it names none, or one that cannot be opened.
         SetupError: its package is not installed.
     """
-    kind, _, rest = text.partition(":")
+    kind, _, source = text.partition(":")
     if kind == "vicon":
-        host, port = _host_and_port(text, rest)
+        host, port = _host_and_port(text, source)
         return ViconTracker(host, port, convention, sender, clock)
     if kind == "motioncapture":
-        system, _, host = rest.partition(":")
+        system, _, host = source.partition(":")
         if not system or not (host or system == "mock"):
             raise InputError(
                 f"tracker {text!r}: must be motioncapture:KIND:HOST; kinds are "
                 f"{', '.join(KINDS)}"
             )
         return MotionCaptureTracker(system, host, clock=clock)
-    if kind == "replay" and rest:
-        return ReplayTracker(read_body_track(Path(rest), mount), clock)
+    if kind == "replay" and source:
+        return ReplayTracker(read_body_track(Path(source), mount), clock)
     raise InputError(f"tracker {text!r}: must be {FORMS}")
 
 
-def _host_and_port(text: str, rest: str) -> tuple[str, int]:
-    host, colon, port = rest.partition(":")
+def _host_and_port(text: str, address: str) -> tuple[str, int]:
+    host, colon, port = address.partition(":")
     if not host or (colon and not (port.isascii() and port.isdigit())):
         raise InputError(f"tracker {text!r}: must be vicon:HOST or vicon:HOST:PORT")
     return host, int(port) if colon else PORT

@@ -180,22 +180,22 @@ class _Wall:
 def _listening(host: str, port: int) -> socket.socket:
     if not 0 <= port < 1 << 16:
         raise InputError(f"VICON: port {port}; 0 to 65535, {PORT} unless set otherwise")
-    found = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    listener = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
-        found.bind((_resolved(host), port))
-        found.settimeout(_POLL_S)
+        listener.bind((_resolved(host), port))
+        listener.settimeout(_POLL_S)
         if sys.platform == "linux":
-            found.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+            listener.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
     except OSError as error:
-        found.close()
+        listener.close()
         raise InputError(
             f"VICON: cannot listen at {host}:{port} ({error}); the address must be one "
             "of this computer or 0.0.0.0, and no other program may listen there"
         ) from error
     except InputError:
-        found.close()
+        listener.close()
         raise
-    return found
+    return listener
 
 
 def _resolved(host: str) -> str:

@@ -102,7 +102,7 @@ def drive_arc(
         DeviceLostError: the controller is lost, or has restarted.
     """
     calibration = motor.calibration
-    wanted = distance_m * calibration.erpm_per_ms / _ERPM_PER_STEP
+    target_steps = distance_m * calibration.erpm_per_ms / _ERPM_PER_STEP
     motor.check()
     _require_silence(motor)
     start = _steps(motor)
@@ -110,7 +110,7 @@ def drive_arc(
     check()
     try:
         sent = motor.send(command)
-        while (steps := abs(_steps(motor) - start)) < wanted:
+        while (steps := abs(_steps(motor) - start)) < target_steps:
             check()
             watch.check(steps, motor.values.erpm or 0)
             sent = motor.send(command)
@@ -225,14 +225,14 @@ def fit_arcs(
     slope, foot = np.polyfit(steering, servo, 1)
     away = np.abs((servo - foot) / slope - steering).max()
     mean = sum(arc.steps for arc in arcs) / sum(arc.length_m for arc in arcs)
-    found = {
+    changes = {
         "erpm_per_ms": round(_ERPM_PER_STEP * mean, 1),
         "servo_per_rad": round(float(slope), 4),
         "servo_centre": round(float(foot), 4),
         "wheelbase_m": wheelbase_m,
     }
     return (
-        calibration.changed(found),
+        calibration.changed(changes),
         float(away),
         (max(scales) - min(scales)) / min(scales),
     )
@@ -246,13 +246,13 @@ def read_arcs(path: Path) -> dict[Drive, Arc]:
     """
     if not path.exists():
         return {}
-    found = read_section(str(path), dict[Drive, Arc], files.read_json(path), "")
-    for name, arc in found.items():
+    arcs = read_section(str(path), dict[Drive, Arc], files.read_json(path), "")
+    for name, arc in arcs.items():
         try:
             arc.check()
         except InputError as error:
             raise InputError(f"{path}: {name}: {error}") from error
-    return found
+    return arcs
 
 
 def write_arcs(path: Path, arcs: Mapping[Drive, Arc]) -> None:
@@ -271,8 +271,8 @@ def _steps(motor: VescMotor) -> int:
         read = motor.read()
         if read is not None and read.time_s > asked:
             if read.fault or read.is_killed:
-                found = read.fault_name if read.fault else "its kill switch is pressed"
-                raise InputError(f"VESC: {found}; mend it, and begin again")
+                reason = read.fault_name if read.fault else "its kill switch is pressed"
+                raise InputError(f"VESC: {reason}; mend it, and begin again")
             return motor.values.tachometer or 0
         time.sleep(0.01)
 

@@ -49,10 +49,10 @@ class SerialLink:
                 port, baudrate, timeout=PAUSE_S, exclusive=True
             )
         except (serial.SerialException, OSError, ValueError) as err:
-            found = ", ".join(sorted(p.device for p in list_ports.comports()))
+            ports = ", ".join(sorted(p.device for p in list_ports.comports()))
             raise InputError(
                 f"{port}: {err}; plug the controller in, close other programs that use "
-                f"it, join the group of the port (dialout); ports: {found or 'none'}"
+                f"it, join the group of the port (dialout); ports: {ports or 'none'}"
             ) from err
         self._newest: dict[int, Answer] = {}
         self._heard, self._writing, self._closing = Condition(), Lock(), Event()
@@ -143,9 +143,9 @@ class SerialLink:
         try:
             while not self._closing.is_set():
                 data = self._serial.read(self._serial.in_waiting or 1)
-                found = decoder.feed(data) if data else decoder.flush()
+                payloads = decoder.feed(data) if data else decoder.flush()
                 with self._heard:
-                    for payload in found:
+                    for payload in payloads:
                         self._newest[payload[0]] = Answer(payload, time.monotonic())
                     self._heard.notify_all()
         except Exception as err:  # termios.error and TypeError, too, of a port gone

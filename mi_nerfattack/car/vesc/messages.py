@@ -167,7 +167,7 @@ def parse_values(payload: bytes) -> Values:
     mask, offset = _ALL, 1
     if payload[0] == Id.GET_VALUES_SELECTIVE:
         mask, offset = int.from_bytes(payload[1:5], "big"), 5
-    found: dict[str, float] = {}
+    numbers: dict[str, float] = {}
     for bit, (kind, scale, name) in enumerate(_FIELDS):
         if not mask >> bit & 1:
             continue
@@ -176,9 +176,9 @@ def parse_values(payload: bytes) -> Values:
             break
         if name is not None:
             (value,) = struct.unpack_from(kind, payload, offset)
-            found[name] = value if scale == 1 else value / scale
+            numbers[name] = value if scale == 1 else value / scale
         offset = end
-    return Values(**found)  # pyright: ignore[reportArgumentType]
+    return Values(**numbers)  # pyright: ignore[reportArgumentType]
 
 
 def parse_firmware(payload: bytes) -> Firmware:

@@ -169,7 +169,7 @@ class VescMotor(AbstractMotor):
         if (values.tachometer_absolute or 0) < self._way:
             self._lose("it has started anew")
         self._way = values.tachometer_absolute or 0
-        return self._told(values, answer.time_s)
+        return self._motor_values(values, answer.time_s)
 
     def close(self) -> None:
         """Let go of the port, after a brake if it was armed; twice does no harm."""
@@ -185,7 +185,7 @@ class VescMotor(AbstractMotor):
             f"{self._link.port}: {reason}; check cable and battery, and arm it again"
         )
 
-    def _told(self, values: Values, time_s: float) -> MotorValues:
+    def _motor_values(self, values: Values, time_s: float) -> MotorValues:
         speed = (
             None if values.erpm is None else values.erpm / self.calibration.erpm_per_ms
         )

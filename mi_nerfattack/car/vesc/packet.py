@@ -57,19 +57,19 @@ class FrameDecoder:
         return self._take(is_over=True)
 
     def _take(self, is_over: bool) -> list[bytes]:
-        held, position, found = self._held, 0, []
+        held, position, payloads = self._held, 0, []
         while match := _START.search(held, position):
             position = match.start()
             payload = _payload_at(held, position)
             if payload:
-                found.append(payload)
+                payloads.append(payload)
                 position += _head_size(held[position]) + len(payload) + 3
             elif payload is None and not is_over:
                 break
             else:
                 position += 1
         del held[: position if match else len(held)]
-        return found
+        return payloads
 
 
 def _payload_at(held: bytearray, position: int) -> bytes | None:

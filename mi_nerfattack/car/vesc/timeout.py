@@ -81,7 +81,7 @@ def set_timeout(
         )
     if after != patched:
         raise InputError(
-            f"VESC: its timeout stays {_told(after)} though it was set; "
+            f"VESC: its timeout stays {_timeout_text(after)} though it was set; "
             f"{_by_hand(calibration)}"
         )
 
@@ -115,15 +115,15 @@ def prove_timeout(
     limit_s, is_braked = calibration.timeout_ms / 1000 + _MARGIN_S, True
     for _ in range(_TRIES):
         silent, turning = _turn_wheels(link, calibration, check)
-        late, seen = _fall_silent(link, silent, limit_s, check)
-        if not seen[-1].has_timed_out:
+        late, readings = _fall_silent(link, silent, limit_s, check)
+        if not readings[-1].has_timed_out:
             raise InputError(
                 f"VESC: {1000 * limit_s:.0f} ms after the last command it does not "
                 f"brake, though its timeout reads {calibration.timeout_ms} ms; do not "
                 "drive with it"
             )
-        seen += _see_it_brake(link, turning, seen[-1], check)
-        is_braked = _is_braked(seen, calibration.brake_current_a)
+        readings += _see_it_brake(link, turning, readings[-1], check)
+        is_braked = _is_braked(readings, calibration.brake_current_a)
         if is_braked and late < limit_s + _LATE_S:
             return
     if not is_braked:
@@ -164,21 +164,21 @@ def _fall_silent(
     link: SerialLink, silent: float, limit_s: float, check: Callable[[], None]
 ) -> tuple[float, list[Values]]:
     """Return all values up to the first asked for past the limit, and how late."""
-    seen: list[Values] = []
+    readings: list[Values] = []
     while True:
         time.sleep(0.01)
         asked = time.monotonic()
         heard, values = _watch(link, check)
-        seen.append(values)
+        readings.append(values)
         if asked > silent + limit_s:
-            return heard - silent, seen
+            return heard - silent, readings
 
 
 def _see_it_brake(
     link: SerialLink, turning: int, values: Values, check: Callable[[], None]
 ) -> list[Values]:
     """Return the values that follow, until the wheels are at half their speed."""
-    end, seen = time.monotonic() + _STOP_S, []
+    end, readings = time.monotonic() + _STOP_S, []
     while abs(values.erpm or 0) > turning / 2:
         if time.monotonic() > end:
             raise InputError(
@@ -187,18 +187,18 @@ def _see_it_brake(
             )
         time.sleep(0.01)
         _, values = _watch(link, check)
-        seen.append(values)
-    return seen
+        readings.append(values)
+    return readings
 
 
-def _is_braked(seen: list[Values], brake_current_a: float) -> bool:
+def _is_braked(readings: list[Values], brake_current_a: float) -> bool:
     """Whether a current brakes: lifted wheels come to rest without one, too.
 
     Each value is a mean since the one before. Its sign tells nothing: so slowly, even
     braking takes power.
     """
-    turning = [_current(values) for values in seen if not values.has_timed_out]
-    braking = [_current(values) for values in seen if values.has_timed_out]
+    turning = [_current(values) for values in readings if not values.has_timed_out]
+    braking = [_current(values) for values in readings if values.has_timed_out]
     held_a = turning[-1] if turning else 0.0
     return max(braking) > max(_SHARE * brake_current_a, _RISE * held_a)
 
@@ -242,12 +242,12 @@ def _configuration(link: SerialLink, firmware: Firmware) -> bytes:
 
 def _patched(configuration: bytes, calibration: Calibration) -> bytes:
     """Return a configuration with the calibration's timeout and brake current."""
-    wanted = _TIMEOUT.pack(calibration.timeout_ms, calibration.brake_current_a)
+    packed = _TIMEOUT.pack(calibration.timeout_ms, calibration.brake_current_a)
     end = _HEAD.size + _TIMEOUT.size
-    return configuration[: _HEAD.size] + wanted + configuration[end:]
+    return configuration[: _HEAD.size] + packed + configuration[end:]
 
 
-def _told(configuration: bytes) -> str:
+def _timeout_text(configuration: bytes) -> str:
     timeout_ms, current_a = _TIMEOUT.unpack_from(configuration, _HEAD.size)
     return f"{timeout_ms} ms with {current_a:g} A"
 
@@ -263,12 +263,13 @@ def _ask_for_flash(
     firmware: Firmware, before: bytes, calibration: Calibration, confirm: Confirm
 ) -> None:
     question = (
-        f"The controller (firmware {firmware}) has a timeout of {_told(before)}. Write "
-        f"{calibration.timeout_ms} ms with {calibration.brake_current_a:g} A to its "
-        "flash memory?"
+        f"The controller (firmware {firmware}) has a timeout of "
+        f"{_timeout_text(before)}. Write {calibration.timeout_ms} ms with "
+        f"{calibration.brake_current_a:g} A to its flash memory?"
     )
     if not confirm(question):
         raise InputError(
-            f"VESC: firmware {firmware} keeps its timeout of {_told(before)} unless "
-            f"its flash memory may be written; allow it, or {_by_hand(calibration)}"
+            f"VESC: firmware {firmware} keeps its timeout of "
+            f"{_timeout_text(before)} unless its flash memory may be written; allow "
+            f"it, or {_by_hand(calibration)}"
         )

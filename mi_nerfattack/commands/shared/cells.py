@@ -48,20 +48,22 @@ def do_cells(
     each = {cell.kind: cell for cell in cells}
     periods = {kind: planned_periods(cell.scenario) for kind, cell in each.items()}
     planned = [periods[cell.kind] for cell in cells]
-    kept = 0
+    resumed_periods = 0
     with StageBars() as bars:
 
         def show(sweep: Sweep) -> None:
-            nonlocal kept
+            nonlocal resumed_periods
             done = sum(planned[index] for index in sweep.complete)
-            if not sweep.steps and len(sweep.complete) == sweep.kept:
-                kept = done
+            if not sweep.steps and len(sweep.complete) == sweep.already_complete:
+                resumed_periods = done
             state = f"{len(sweep.complete)}/{len(cells)}, {sweep.steps} control periods"
             if sweep.errors:
                 state += f", {len(sweep.errors)} failed"
             # A cell may take more periods than planned, and is not done before its end.
-            done = max(done, min(kept + sweep.steps, sum(planned) - 1))
-            bars.show("cells", done, sum(planned), state, kept=done == kept)
+            done = max(done, min(resumed_periods + sweep.steps, sum(planned) - 1))
+            bars.show(
+                "cells", done, sum(planned), state, resumed=done == resumed_periods
+            )
 
         work = Cells(tuple(cells), folder.resolve(), cores)
         sweep = Sweep(work, show, taken or Taken())

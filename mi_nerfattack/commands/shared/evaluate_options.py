@@ -126,11 +126,11 @@ def parse_conditions(
         parsed.append(Conditions(condition.sky, condition.exposure_ev, spp))
     if not parsed or len(set(parsed)) < len(parsed):
         raise InputError(f"--conditions: {conditions}; at least one, each once")
-    found = []
+    environments = []
     for name in names:
         several = [Conditions(spp=spp)] if name == "surrogate" else parsed
-        found += [EnvironmentUnder(name, item) for item in several]
-    return tuple(found)
+        environments += [EnvironmentUnder(name, item) for item in several]
+    return tuple(environments)
 
 
 def parse_scales(

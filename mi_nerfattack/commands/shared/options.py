@@ -60,24 +60,24 @@ def command_line(name: str, options: Any) -> str:
 
 
 def _words(options: Any) -> list[str]:
-    found: list[str] = []
+    words: list[str] = []
     for item in fields(options):
         value = getattr(options, item.name)
         if is_dataclass(value):
-            found += _words(value)
+            words += _words(value)
         elif item.default is not MISSING and value == item.default:
             continue
         elif item.name in ("policy", "run_folders"):
-            found[:0] = map(_word, _parts(value))
+            words[:0] = map(_word, _operands(value))
         elif item.name == "settings":
-            found += [part for one in value for part in ("--set", _word(one))]
+            words += [part for one in value for part in ("--set", _word(one))]
         else:
-            found.append("--" + item.name.replace("_", "-"))
-            found += [_word(part) for part in _parts(value) if part is not True]
-    return found
+            words.append("--" + item.name.replace("_", "-"))
+            words += [_word(part) for part in _operands(value) if part is not True]
+    return words
 
 
-def _parts(value: Any) -> list[Any]:
+def _operands(value: Any) -> list[Any]:
     if isinstance(value, Mapping):
         return [part for pair in value.items() for part in pair]
     return list(value) if isinstance(value, tuple) else [value]

@@ -73,7 +73,7 @@ class PolicyFile:
             scenario, _ = load_scenario(path, settings=settings)
             rig, vehicle = scenario.rig(), scenario.vehicle
             return cls(name, scenario.policy, rig, vehicle, scenario)
-        found: dict[str, Any] = {}
+        sections: dict[str, Any] = {}
         for key, kind in (
             ("policy", PolicySection),
             ("camera", CameraSection),
@@ -82,22 +82,22 @@ class PolicyFile:
         ):
             if key in values:
                 value = values.pop(key)
-                found[key] = read_section(f"{name}: {key}", kind, value, folder)
-        if found and values and "scene" not in values:
+                sections[key] = read_section(f"{name}: {key}", kind, value, folder)
+        if sections and values and "scene" not in values:
             raise InputError(
                 f"{name}: {', '.join(values)}: has no effect without [scene]; allowed: "
                 "policy, camera or cameras, vehicle"
             )
-        if {"camera", "cameras"} <= set(found):
+        if {"camera", "cameras"} <= set(sections):
             raise InputError(
                 f"{name}: cameras: stands beside [camera]; give one of them"
             )
         rig = None
-        if "camera" in found:
-            rig = found["camera"].rig()
-        elif "cameras" in found:
-            rig = rig_of(found["cameras"])
-        return cls(name, found.get("policy"), rig, found.get("vehicle"))
+        if "camera" in sections:
+            rig = sections["camera"].rig()
+        elif "cameras" in sections:
+            rig = rig_of(sections["cameras"])
+        return cls(name, sections.get("policy"), rig, sections.get("vehicle"))
 
     @property
     def section(self) -> AbstractPolicySection:

@@ -71,7 +71,7 @@ class StageBars:
         )
 
     def show(
-        self, stage: str, done: float, total: float, state: str, kept: bool = False
+        self, stage: str, done: float, total: float, state: str, resumed: bool = False
     ) -> None:
         """Show how far a stage is, and how long it will take.
 
@@ -80,13 +80,13 @@ class StageBars:
             done: units of work done.
             total: units of the whole stage.
             state: text next to the bar.
-            kept: whether these units were done before, so that their time says nothing
-                about the other units.
+            resumed: whether these units were done before, so that their time says
+                nothing about the other units.
         """
         if stage not in self._tasks:
             self._tasks[stage] = self._bars.add_task(stage, total=total, state=state)
         number = self._tasks[stage]
-        if kept:
+        if resumed:
             self._bars.reset(number)
         self._bars.update(number, completed=done, state=state)
         now, task = time.perf_counter(), self._bars.tasks[number]
@@ -273,5 +273,5 @@ def progress(total: int | None = None, stage: str = "steps") -> ProgressBar:
 
 
 def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes}:{rest:02d}"
+    minutes, remainder_s = divmod(round(seconds), 60)
+    return f"{minutes}:{remainder_s:02d}"

@@ -78,7 +78,7 @@ def stdout_to_stderr() -> Iterator[None]:
     if sys.stdout is None or sys.stderr is None:  # closed before we started
         yield
         return
-    kept = os.dup(1)
+    saved_stdout = os.dup(1)
     try:
         os.dup2(2, 1)
         with contextlib.redirect_stdout(sys.stderr):
@@ -86,5 +86,5 @@ def stdout_to_stderr() -> Iterator[None]:
     finally:
         if os.name == "posix":
             ctypes.pythonapi.fflush(None)  # what C has not written yet
-        os.dup2(kept, 1)
-        os.close(kept)
+        os.dup2(saved_stdout, 1)
+        os.close(saved_stdout)

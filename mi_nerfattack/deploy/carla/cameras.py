@@ -74,10 +74,10 @@ class CarlaCameras:
         deadline = time.monotonic() + self._timeout_s
         colour = self._colour.take(frame, deadline, self._timeout_s)
         depth = self._depth.take(frame, deadline, self._timeout_s)
-        size = self.camera.width, self.camera.height
-        planar = decode_depth(read_bgra(depth.raw_data, *size))
+        width, height = self.camera.width, self.camera.height
+        planar = decode_depth(read_bgra(depth.raw_data, width, height))
         return CameraFrame(
-            decode_colour(read_bgra(colour.raw_data, *size)),
+            decode_colour(read_bgra(colour.raw_data, width, height)),
             along_rays(planar, self.camera),
             camera_from_carla(read_pose(colour.transform)),
         )
@@ -94,9 +94,9 @@ class _Inbox:
     def take(self, frame: int, deadline: float, timeout_s: float) -> Any:
         """Wait for the image of a frame and drop older ones."""
         while True:
-            rest = max(deadline - time.monotonic(), 0.0)
+            remaining_s = max(deadline - time.monotonic(), 0.0)
             try:
-                image = self._images.get(timeout=rest)
+                image = self._images.get(timeout=remaining_s)
             except queue.Empty:
                 raise InputError(
                     f"{self._kind}: no image of frame {frame} within {timeout_s:g} s; "

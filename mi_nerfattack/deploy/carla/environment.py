@@ -110,8 +110,8 @@ class CarlaEnvironment(AbstractEnvironment):
             self.driver.begin(self.session, self._actor, axles, start, speed, height)
             for _ in range(max(1, round(_SETTLE_S / self.period))):
                 frame = self.session.tick()
-            seen = self._observe(frame)
-        return self._paster.paste(seen)
+            camera_frame = self._observe(frame)
+        return self._paster.paste(camera_frame)
 
     def step(self, control: Controls) -> CameraFrame:
         """Drive one period."""
@@ -120,8 +120,8 @@ class CarlaEnvironment(AbstractEnvironment):
         checked_control(control, self.control_names)
         with self.session.guarded("drive on"):
             self.driver.apply(control)
-            seen = self._observe(self.session.tick())
-        return self._paster.paste(seen)
+            camera_frame = self._observe(self.session.tick())
+        return self._paster.paste(camera_frame)
 
     @property
     def state(self) -> np.ndarray:

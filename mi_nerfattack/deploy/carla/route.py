@@ -56,11 +56,11 @@ def read_leaderboard(path: Path) -> list[TownRoute]:
         root = ElementTree.fromstring(files.read_bytes(path, _MAX_BYTES))
     except ElementTree.ParseError as error:
         raise InputError(f"{path}: not XML ({error})") from error
-    found: dict[str, TownRoute] = {}
+    routes: dict[str, TownRoute] = {}
     for element in root.iter("route"):
         name, town = element.get("id"), element.get("town") or element.get("map")
         where = f"{path}: route {name!r}"
-        if not name or not town or name in found:
+        if not name or not town or name in routes:
             raise InputError(f"{where}: needs an id of its own, and a town")
         items = [*element.findall("waypoints/position"), *element.findall("waypoint")]
         try:
@@ -69,10 +69,10 @@ def read_leaderboard(path: Path) -> list[TownRoute]:
             raise InputError(f"{where}: a position without x, y, z: {error}") from error
         if len(points) < 2 or not np.isfinite(points).all():
             raise InputError(f"{where}: needs two finite positions or more")
-        found[name] = TownRoute(name, town, point_from_carla(points))
-    if not found:
+        routes[name] = TownRoute(name, town, point_from_carla(points))
+    if not routes:
         raise InputError(f"{path}: no <route>; give routes of the CARLA leaderboard")
-    return list(found.values())
+    return list(routes.values())
 
 
 def town_routes(
@@ -145,13 +145,13 @@ def _shortest(place: str, first: Any, last: Any, spacing_m: float) -> list[Any]:
     order = itertools.count()
     queue: list[tuple[float, int, float, Any, Any]] = []
     heapq.heappush(queue, (0.0, next(order), 0.0, first, None))
-    seen: set[tuple[int, ...]] = set()
-    while queue and len(seen) <= _MAX_POINTS:
+    visited: set[tuple[int, ...]] = set()
+    while queue and len(visited) <= _MAX_POINTS:
         _, _, driven, waypoint, trail = heapq.heappop(queue)
         key = _key(waypoint, spacing_m)
-        if key in seen:
+        if key in visited:
             continue
-        seen.add(key)
+        visited.add(key)
         trail = (waypoint, trail)
         if driven > 0 and _arrived(waypoint, last, spacing_m):
             return _unroll(trail)
@@ -183,11 +183,11 @@ def _distance(waypoint: Any, other: Any) -> float:
 
 
 def _unroll(trail: Any) -> list[Any]:
-    found = []
+    waypoints = []
     while trail is not None:
         waypoint, trail = trail
-        found.append(waypoint)
-    return found[::-1]
+        waypoints.append(waypoint)
+    return waypoints[::-1]
 
 
 def _key(waypoint: Any, spacing_m: float) -> tuple[int, ...]:

@@ -48,15 +48,15 @@ class CarlaServer:
     load_timeout_s: Seconds = 120.0
 
     @classmethod
-    def parse(cls, text: str, **more: Any) -> CarlaServer:
-        """Read "HOST:PORT" or "HOST:PORT/TOWN"; `more` are further arguments."""
+    def parse(cls, text: str, **options: Any) -> CarlaServer:
+        """Read "HOST:PORT" or "HOST:PORT/TOWN"; `options` are further arguments."""
         match = re.fullmatch(r"([^:/]+):(\d{1,5})(?:/(\w+))?", text)
         if match is None:
             raise InputError(
                 f"server: {text!r}; HOST:PORT or HOST:PORT/TOWN, as 127.0.0.1:2000"
             )
         host, port, town = match.groups()
-        return cls(host, int(port), town, **more)
+        return cls(host, int(port), town, **options)
 
 
 def load_client() -> Any:

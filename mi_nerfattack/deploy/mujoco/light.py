@@ -92,10 +92,10 @@ def read_lighting(scene: Any) -> Lighting:
     emitters = [e for e in scene.emitters() if _is_far(e)]
     sun, sky, direction = np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 1.0])
     for emitter in emitters:
-        found = _irradiance(emitter, scene)
-        if found[0].sum() > sun.sum():
-            direction = found[2]
-        sun, sky = sun + found[0], sky + found[1]
+        light = _irradiance(emitter, scene)
+        if light[0].sum() > sun.sum():
+            direction = light[2]
+        sun, sky = sun + light[0], sky + light[1]
     if not emitters:
         above, beside = _indoor_irradiance(scene)
         sun, sky = np.maximum(above - beside, 0), beside
@@ -190,8 +190,8 @@ def _indoor_irradiance(scene: Any) -> tuple[np.ndarray, np.ndarray]:
     ):
         ray = mi.RayDifferential3f(mi.Ray3f(origin, direction))
         radiance, *_ = scene.integrator().sample(scene, sampler, ray)
-        found = math.pi * rgb_rows(radiance).mean(axis=0).astype(np.float64)
-        result.append(found + _from_points(scene, sampler, origin, normal))
+        irradiance = math.pi * rgb_rows(radiance).mean(axis=0).astype(np.float64)
+        result.append(irradiance + _from_points(scene, sampler, origin, normal))
     return result[0], result[1]
 
 
@@ -202,8 +202,8 @@ def _from_points(scene: Any, sampler: Any, origin: Any, normal: Any) -> np.ndarr
     for emitter in scene.emitters():
         if mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
             sample, weight = emitter.sample_direction(si, sampler.next_2d())
-            seen = ~scene.ray_test(si.spawn_ray_to(sample.p))
-            slant = dr.select(seen, dr.maximum(dr.dot(sample.d, normal), 0), 0)
+            visible = ~scene.ray_test(si.spawn_ray_to(sample.p))
+            slant = dr.select(visible, dr.maximum(dr.dot(sample.d, normal), 0), 0)
             total += rgb_rows(weight * slant).mean(axis=0)
     return total
 

@@ -132,11 +132,11 @@ def _add_mesh(spec: Any, name: str, mesh: DrawnMesh) -> None:
     corners = mesh.vertices[mesh.faces]
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(area, axis=1)
-    kept = length > 1e-12
-    flat = np.repeat((area[kept] / length[kept, None])[:, None], 3, axis=1)
-    normals = flat if mesh.normals is None else mesh.normals[mesh.faces[kept]]
-    uv = mesh.uv[mesh.faces[kept]]
-    corners = corners[kept]
+    mask = length > 1e-12
+    flat = np.repeat((area[mask] / length[mask, None])[:, None], 3, axis=1)
+    normals = flat if mesh.normals is None else mesh.normals[mesh.faces[mask]]
+    uv = mesh.uv[mesh.faces[mask]]
+    corners = corners[mask]
     if mesh.two_sided:
         corners = np.concatenate([corners, corners[:, ::-1]])
         normals = np.concatenate([normals, -normals[:, ::-1]])
@@ -259,17 +259,19 @@ def _albedo(bsdf: Any, uv: np.ndarray) -> np.ndarray:
     si.uv = mi.Point2f(uv[:2].astype(np.float32))
     si.wi = mi.Vector3f(0, 0, 1)
     # a uniform material answers with one value for all texels
-    found = bsdf.eval_diffuse_reflectance(si) + dr.zeros(mi.Float, uv.shape[1])
-    return rgb_rows(found)
+    albedo = bsdf.eval_diffuse_reflectance(si) + dr.zeros(mi.Float, uv.shape[1])
+    return rgb_rows(albedo)
 
 
 def _common_transform(parameters: Any) -> np.ndarray:
     """Return the (3, 3) transform of coordinates that a material's images share."""
     keys = [key for key in parameters.keys() if key.endswith(".to_uv")]
-    found = [np.array(parameters[key].matrix, np.float64).reshape(3, 3) for key in keys]
-    if any(not np.allclose(matrix, found[0]) for matrix in found):
+    matrices = [
+        np.array(parameters[key].matrix, np.float64).reshape(3, 3) for key in keys
+    ]
+    if any(not np.allclose(matrix, matrices[0]) for matrix in matrices):
         raise InputError(f"textures {', '.join(keys)}: MuJoCo needs the same to_uv")
-    return found[0] if found else np.eye(3)
+    return matrices[0] if matrices else np.eye(3)
 
 
 def rgb_rows(value: Any) -> np.ndarray:

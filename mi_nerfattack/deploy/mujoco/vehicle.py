@@ -181,10 +181,10 @@ class MujocoVehicle(AbstractVehicle):
         """Drive one period."""
         if self._speed is None:
             raise InputError("vehicle: advance comes after reset")
-        steer, *more = checked_control(control, self.control_names).tolist()
+        steer, *others = checked_control(control, self.control_names).tolist()
         limited = min(max(steer, -self.max_control), self.max_control)
         acceleration = (
-            min(max(more[0], self._force[0]), self._force[1]) if more else 0.0
+            min(max(others[0], self._force[0]), self._force[1]) if others else 0.0
         )
         angle = self.steering.angle(limited, self._speed, self.car.wheelbase)
         angle = min(max(angle, -self.car.max_steer), self.car.max_steer)
@@ -250,11 +250,11 @@ class MujocoVehicle(AbstractVehicle):
         self._steer += min(max(angle - self._steer, -reach), reach)
         missing = speed - self.car.wheel_radius * data.ten_velocity[0]
         low, high = self._force
-        wanted = _SPEED_GAIN * missing + _SPEED_INTEGRAL_GAIN * self._excess
-        wanted += change / dt
-        if low < wanted < high:  # the integral does not wind up at the limit
+        acceleration = _SPEED_GAIN * missing + _SPEED_INTEGRAL_GAIN * self._excess
+        acceleration += change / dt
+        if low < acceleration < high:  # the integral does not wind up at the limit
             self._excess += missing * dt
-        data.ctrl[:] = self._steer, min(max(wanted, low), high)
+        data.ctrl[:] = self._steer, min(max(acceleration, low), high)
         mujoco.mj_step(model, data)
 
     def _settle(self) -> np.ndarray:

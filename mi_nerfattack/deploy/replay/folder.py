@@ -63,13 +63,13 @@ class FolderRecording(AbstractRecording):
         )
 
 
-def required_camera(source: Path, own: Camera | None, given: Camera | None) -> Camera:
-    """Return a recording's own camera, or the one given.
+def required_camera(source: Path, own: Camera | None, default: Camera | None) -> Camera:
+    """Return a recording's own camera, or the default one.
 
     Raises:
         InputError: there is none.
     """
-    camera = given if own is None else own
+    camera = default if own is None else own
     if camera is None:
         raise InputError(f"{source}: no intrinsics; add a camera, or give one")
     return camera
@@ -77,19 +77,19 @@ def required_camera(source: Path, own: Camera | None, given: Camera | None) -> C
 
 def _pose_file(folder: Path) -> Path:
     with files.reported(folder):
-        found = [folder / name for name in _POSE_FILES if (folder / name).is_file()]
-    if not found:
+        paths = [folder / name for name in _POSE_FILES if (folder / name).is_file()]
+    if not paths:
         raise InputError(
             f"{folder}: no poses; looked for {', '.join(_POSE_FILES)}; estimate them "
             f"with 'mi-nerfattack capture photographs {folder} -o FOLDER'"
         )
-    return found[0]
+    return paths[0]
 
 
 def _find_images(table: PoseTable) -> list[Path]:
     if not table.names:
         raise InputError(f"{table.where}: its rows name no images; add a column 'file'")
-    folder, found = table.where.parent, []
+    folder, paths = table.where.parent, []
     for index, name in enumerate(table.names):
         base = str(folder / name.replace("\\", "/"))
         candidates = [Path(base + end) for end in ("", *files.IMAGE_SUFFIXES)]
@@ -99,8 +99,8 @@ def _find_images(table: PoseTable) -> list[Path]:
                 f"{table.where}: row {index}: {name!r} is not there; restore the "
                 "image or take the row out"
             )
-        found.append(path)
-    return found
+        paths.append(path)
+    return paths
 
 
 def _read_depth(table: PoseTable, camera: Camera) -> np.ndarray | None:
@@ -115,8 +115,10 @@ def _read_depth(table: PoseTable, camera: Camera) -> np.ndarray | None:
     depth = files.read_safetensors(path)[0].get("depth")
     shape = len(table.camera_to_world), camera.height, camera.width
     if depth is None or depth.shape != shape:
-        found = None if depth is None else depth.shape
-        raise InputError(f"{path}: tensor 'depth' has shape {found}; needs {shape}")
+        stored_shape = None if depth is None else depth.shape
+        raise InputError(
+            f"{path}: tensor 'depth' has shape {stored_shape}; needs {shape}"
+        )
     if (depth <= 0).any():
         raise InputError(
             f"{path}: tensor 'depth' holds a depth of 0 or less; write infinity where "

@@ -76,15 +76,15 @@ class McapTopics:
         Raises:
             InputError: another text, or one name twice.
         """
-        parts = [text.partition("=") for text in texts]
+        pairs = [text.partition("=") for text in texts]
         known = [item.name for item in fields(cls)]
-        names = [name for name, _, topic in parts if name in known and topic]
+        names = [name for name, _, topic in pairs if name in known and topic]
         if len(names) < len(texts) or len(set(names)) < len(names):
             raise InputError(
                 f"--topics: {' '.join(texts)}; NAME=/topic, NAME one of "
                 f"{', '.join(known)}, each once"
             )
-        return cls(**{name: topic for name, _, topic in parts})
+        return cls(**{name: topic for name, _, topic in pairs})
 
 
 _NAMES = McapTopics(
@@ -110,26 +110,27 @@ class McapRecording(AbstractRecording):
         topics: McapTopics | None = None,
     ) -> None:
         topics = topics or McapTopics()
-        found, self.remarks = read_topics(path)
-        images = _choose(path, found, topics, "image", _IMAGES)
+        log_topics, self.remarks = read_topics(path)
+        images = _choose(path, log_topics, topics, "image", _IMAGES)
         if images is None:
             cut = "".join(f" ({remark})" for remark in self.remarks)
             raise InputError(
-                f"{path}: no {' or '.join(_IMAGES)}, so no frame{cut}{_others(found)}"
+                f"{path}: no {' or '.join(_IMAGES)}, so no frame{cut}"
+                f"{_others(log_topics)}"
             )
         self._path, self._images = path, images.decode()
         times = _stamps(images.where, self._images)
-        where, pose_times, poses = _camera_poses(path, found, topics, mount)
-        kept = _with_poses(times, pose_times, poses)
-        if len(times[kept]) != len(times):
+        where, pose_times, poses = _camera_poses(path, log_topics, topics, mount)
+        frames = _with_poses(times, pose_times, poses)
+        if len(times[frames]) != len(times):
             self.remarks += (
-                f"frames {kept.start} to {kept.stop - 1} of {len(times)} are read; "
+                f"frames {frames.start} to {frames.stop - 1} of {len(times)} are read; "
                 f"before and after them there are no poses on {where}",
             )
-        times, self._images = times[kept], self._images[kept]
-        found_poses = poses_of_frames(str(path), where, times, pose_times, poses)
-        self.track = Track(str(path), times, found_poses)
-        own = _calibration(_choose(path, found, topics, "calibration", _INFOS))
+        times, self._images = times[frames], self._images[frames]
+        frame_poses = poses_of_frames(str(path), where, times, pose_times, poses)
+        self.track = Track(str(path), times, frame_poses)
+        own = _calibration(_choose(path, log_topics, topics, "calibration", _INFOS))
         self.camera = required_camera(path, own, camera)
 
     def image(self, index: int) -> np.ndarray:
@@ -164,31 +165,31 @@ def read_vehicle_poses(
     Raises:
         InputError: it cannot be read, or has no poses.
     """
-    found, _ = read_topics(path)
-    _, times, poses = _camera_poses(path, found, topics or McapTopics(), mount)
+    log_topics, _ = read_topics(path)
+    _, times, poses = _camera_poses(path, log_topics, topics or McapTopics(), mount)
     return times, poses @ np.linalg.inv(camera_to_body(mount))
 
 
 def _choose(
     path: Path,
-    found: Mapping[str, Topic],
+    log_topics: Mapping[str, Topic],
     topics: McapTopics,
     role: str,
     kinds: Sequence[str],
 ) -> Topic | None:
     """Return the topic of a role: as named, as we name it, or the only one."""
     named = getattr(topics, role)
-    fitting = [topic for topic in found.values() if topic.kind in kinds]
+    fitting = [topic for topic in log_topics.values() if topic.kind in kinds]
     if named is not None:
         (chosen,) = [topic for topic in fitting if topic.name == named] or [None]
         if chosen is None:
             raise InputError(
-                f"{path}: no {' or '.join(kinds)} on {named}{_others(found)}"
+                f"{path}: no {' or '.join(kinds)} on {named}{_others(log_topics)}"
             )
         return chosen
     usual = getattr(_NAMES, role)
-    if usual in found and found[usual] in fitting:
-        return found[usual]
+    if usual in log_topics and log_topics[usual] in fitting:
+        return log_topics[usual]
     if len(fitting) > 1:
         names = ", ".join(topic.name for topic in fitting)
         raise InputError(
@@ -197,25 +198,26 @@ def _choose(
     return fitting[0] if fitting else None
 
 
-def _others(found: Mapping[str, Topic]) -> str:
-    told = ", ".join(f"{topic.name} ({topic.kind})" for topic in found.values())
-    return f"; it has {told}" if told else ""
+def _others(log_topics: Mapping[str, Topic]) -> str:
+    listing = ", ".join(f"{topic.name} ({topic.kind})" for topic in log_topics.values())
+    return f"; it has {listing}" if listing else ""
 
 
 def _camera_poses(
-    path: Path, found: Mapping[str, Topic], topics: McapTopics, mount: CameraMount
+    path: Path, log_topics: Mapping[str, Topic], topics: McapTopics, mount: CameraMount
 ) -> tuple[str, np.ndarray, np.ndarray]:
     """Return the topic, times (n,) and poses (n, 4, 4) of the camera, OpenCV axes."""
     of_camera, chosen = np.eye(4), None
-    if topics.camera_pose is not None or _NAMES.camera_pose in found:
+    if topics.camera_pose is not None or _NAMES.camera_pose in log_topics:
         if topics.vehicle_pose is None:
-            chosen = _choose(path, found, topics, "camera_pose", _POSES)
+            chosen = _choose(path, log_topics, topics, "camera_pose", _POSES)
     if chosen is None:
         of_camera = camera_to_body(mount)
-        chosen = _choose(path, found, topics, "vehicle_pose", _POSES)
+        chosen = _choose(path, log_topics, topics, "vehicle_pose", _POSES)
     if chosen is None:
         raise InputError(
-            f"{path}: no {', '.join(_POSES)}; record the poses, too{_others(found)}"
+            f"{path}: no {', '.join(_POSES)}; record the poses, too"
+            f"{_others(log_topics)}"
         )
     messages = chosen.decode()
     poses = np.stack([_pose(chosen.where, item) for item in messages]) @ of_camera
@@ -278,10 +280,17 @@ def _calibration(topic: Topic | None) -> Camera | None:
             f"{d[:-4]}; only plumb_bob with k1, k2, p1, p2 and equidistant are read"
         )
     try:
-        # counted from the centre of the first pixel there, from its corner here
-        pinhole = map(float, (k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5))
-        lens = (*d[:2], 0.0, 0.0, *d[2:4]) if is_fisheye else d[:4]
-        size = message.width, message.height
-        return Camera(*size, *pinhole, *lens, is_fisheye=is_fisheye)
+        names = ("k1", "k2", "k3", "k4") if is_fisheye else ("k1", "k2", "p1", "p2")
+        return Camera(
+            width=message.width,
+            height=message.height,
+            fx=float(k[0, 0]),
+            fy=float(k[1, 1]),
+            # counted from the centre of the first pixel there, from its corner here
+            cx=float(k[0, 2] + 0.5),
+            cy=float(k[1, 2] + 0.5),
+            **dict(zip(names, d[:4], strict=True)),
+            is_fisheye=is_fisheye,
+        )
     except InputError as error:
         raise InputError(f"{topic.where}: {error}") from error

@@ -162,11 +162,11 @@ def poses_of_frames(
         InputError: times of poses that do not increase, or a frame without a pose.
     """
     check_times(poses, pose_times)
-    found, is_known = poses_at(pose_times, matrices, times)
+    frame_poses, is_known = poses_at(pose_times, matrices, times)
     if not is_known.all():
         frame = int(np.argmin(is_known))
         raise InputError(
             f"{frames}: frame {frame} at {times[frame]:g} s has no pose within "
             f"{POSE_REACH_S:g} s in {poses}; add poses, or take the frame out"
         )
-    return found
+    return frame_poses

@@ -87,12 +87,12 @@ def definition(kind: str) -> str:
     Args:
         kind: ``PACKAGE/NAME``.
     """
-    parts, text = [kind], _FIELDS[kind]
-    for part in parts:  # grows
+    kinds, text = [kind], _FIELDS[kind]
+    for part in kinds:  # grows
         for line in _FIELDS[part].splitlines():
             name = line.split()[0].split("[")[0]
-            if name in _FIELDS and name not in parts:
-                parts.append(name)
+            if name in _FIELDS and name not in kinds:
+                kinds.append(name)
                 text += f"{'=' * 80}\nMSG: {name}\n{_FIELDS[name]}"
     return text
 
@@ -135,15 +135,15 @@ class Topic:
         Raises:
             InputError: one is damaged.
         """
-        found = []
+        messages = []
         for index, data in enumerate(self.raw):
             try:
-                found.append(decoder(self.kind)(data))
+                messages.append(decoder(self.kind)(data))
             except (struct.error, ValueError, IndexError, OverflowError) as error:
                 raise InputError(
                     f"{self.where}: message {index} is no {self.kind} ({error})"
                 ) from error
-        return found
+        return messages
 
 
 def read_topics(path: Path) -> tuple[dict[str, Topic], tuple[str, ...]]:
@@ -158,7 +158,7 @@ def read_topics(path: Path) -> tuple[dict[str, Topic], tuple[str, ...]]:
     except SetupError as error:
         raise InputError(f"{path}: {error}") from error
     raw, remarks = _ended(files.read_bytes(path, MAX_LOG_BYTES))
-    found: dict[str, Topic] = {}
+    topics: dict[str, Topic] = {}
     others: set[str] = set()
     try:
         for topic, schema, encoding, data in _messages(path, raw):
@@ -166,7 +166,7 @@ def read_topics(path: Path) -> tuple[dict[str, Topic], tuple[str, ...]]:
                 others.add(f"{topic} has {schema!r} in {encoding!r}")
                 continue
             where = f"{path}: {topic}"
-            found.setdefault(topic, Topic(where, topic, schema, [])).raw.append(data)
+            topics.setdefault(topic, Topic(where, topic, schema, [])).raw.append(data)
     except InputError:
         raise
     except (McapError, struct.error, ValueError, KeyError, OverflowError) as error:
@@ -174,12 +174,12 @@ def read_topics(path: Path) -> tuple[dict[str, Topic], tuple[str, ...]]:
             f"{path}: damaged log ({type(error).__name__}: {error}); copy it again, or "
             "repair it with 'mcap recover'"
         ) from error
-    if others and not found:
+    if others and not topics:
         raise InputError(
             f"{path}: {', '.join(sorted(others)[:5])}; only ROS 2 messages in CDR are "
             "read"
         )
-    return found, remarks
+    return topics, remarks
 
 
 def _ended(raw: bytes) -> tuple[bytes, tuple[str, ...]]:
@@ -189,15 +189,15 @@ def _ended(raw: bytes) -> tuple[bytes, tuple[str, ...]]:
     """
     if raw.endswith(_MAGIC) and len(raw) > len(_MAGIC):
         return raw, ()
-    whole, end = len(_MAGIC), len(_MAGIC)
+    record_end, end = len(_MAGIC), len(_MAGIC)
     while end + _HEAD.size <= len(raw):
         kind, size = _HEAD.unpack_from(raw, end)
         end += _HEAD.size + size
         if end > len(raw) or kind == _FOOTER:
             break
-        whole = end
-    remark = f"cut off; {whole} of {len(raw)} bytes are read"
-    return raw[:whole] + _HEAD.pack(_FOOTER, 20) + bytes(20) + _MAGIC, (remark,)
+        record_end = end
+    remark = f"cut off; {record_end} of {len(raw)} bytes are read"
+    return raw[:record_end] + _HEAD.pack(_FOOTER, 20) + bytes(20) + _MAGIC, (remark,)
 
 
 def _messages(path: Path, raw: bytes) -> Iterator[tuple[str, str, str, bytes]]:

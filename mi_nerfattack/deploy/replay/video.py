@@ -100,11 +100,11 @@ class VideoRecording(AbstractRecording):
                 announced, base = stream.frames, stream.time_base
         except FFmpegError as error:
             raise damaged_video(self._path, error) from error
-        found = [(stamp, hidden) for stamp, hidden in packets if stamp is not None]
-        stamps = [stamp for stamp, hidden in found if not hidden]
-        if not stamps or base is None or announced > len(found):
+        stamped = [(stamp, hidden) for stamp, hidden in packets if stamp is not None]
+        stamps = [stamp for stamp, hidden in stamped if not hidden]
+        if not stamps or base is None or announced > len(stamped):
             raise InputError(
-                f"{self._path}: {len(found)} of {announced} frames are there; "
+                f"{self._path}: {len(stamped)} of {announced} frames are there; "
                 "truncated: copy it again"
             )
         times = np.sort(np.array([float(stamp * base) for stamp in stamps]))
@@ -115,11 +115,11 @@ class VideoRecording(AbstractRecording):
 def _pose_file(path: Path) -> Path:
     candidates = [path.with_suffix(suffix) for suffix in SUFFIXES]
     with files.reported(path):
-        found = [item for item in candidates if item.is_file()]
-    if not found:
+        paths = [item for item in candidates if item.is_file()]
+    if not paths:
         names = ", ".join(item.name for item in candidates)
         raise InputError(f"{path}: no pose file beside it; add one of {names}")
-    return found[0]
+    return paths[0]
 
 
 def _assign(path: Path, table: PoseTable, times: np.ndarray) -> np.ndarray:

@@ -92,8 +92,13 @@ class Stands:
         return len(self.yaw)
 
     def __getitem__(self, rows: np.ndarray | slice) -> Stands:
-        parts = (self.centre, self.ground, self.yaw, self.scale)
-        return Stands(self.shape, *(part[rows] for part in parts))
+        return Stands(
+            self.shape,
+            centre=self.centre[rows],
+            ground=self.ground[rows],
+            yaw=self.yaw[rows],
+            scale=self.scale[rows],
+        )
 
     @property
     def half(self) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from mi_nerfattack.deploy.roadside.footprint import Shape, Stands
 from mi_nerfattack.deploy.roadside.surroundings import KERB_M, Surroundings
-from mi_nerfattack.deploy.roadside.view import Seen, look
+from mi_nerfattack.deploy.roadside.view import VisiblePoints, look
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.ranges import (
@@ -105,17 +105,17 @@ class Roadside:
             InputError: no place found for all of them.
         """
         poses = self.find(fields, surroundings, route, stretch, rng, kinds)
-        found = [pose for pose in poses if pose is not None]
-        if len(found) < len(fields):
+        placed = [pose for pose in poses if pose is not None]
+        if len(placed) < len(fields):
             begin, end = stretch
             raise InputError(
-                f"route {route.name!r}: places for {len(found)} of {len(fields)} "
+                f"route {route.name!r}: places for {len(placed)} of {len(fields)} "
                 "objects, off the lanes (patches within one), on free ground and in "
                 f"view for {self.view_s} s of a drive from {begin:.1f} to {end:.1f} m "
                 "of it; ask for fewer or other sizes of them, or move routes or "
                 "obstacles"
             )
-        return found
+        return placed
 
     def find(
         self,
@@ -128,7 +128,7 @@ class Roadside:
     ) -> list[Pose | None]:
         """Draw as :meth:`draw`, with None for objects that find no place."""
         eyes = surroundings.drive(route, *stretch)
-        placed: list[tuple[Stands, Seen]] = []
+        placed: list[tuple[Stands, VisiblePoints]] = []
         poses: list[Pose | None] = []
         for kind, field in zip(kinds or range(len(fields)), fields, strict=True):
             shape, scales = Shape.of(field), self.scales[kind % len(self.scales)]
@@ -138,7 +138,7 @@ class Roadside:
                     shape, scales, surroundings, route, stretch, rng
                 )
                 stands = self._free(stands, surroundings, [item for item, _ in placed])
-                chosen = self._seen(stands, surroundings, eyes, placed)
+                chosen = self._first_visible(stands, surroundings, eyes, placed)
                 if chosen is not None:
                     placed.append(chosen)
                     pose = chosen[0].pose(0)
@@ -216,37 +216,37 @@ class Roadside:
         around = 0.0 if stands.shape.is_patch else self.clearance_m
         return stands[surroundings.stand_free(stands, step, around)]
 
-    def _seen(
+    def _first_visible(
         self,
         stands: Stands,
         surroundings: Surroundings,
         eyes: np.ndarray,
-        placed: list[tuple[Stands, Seen]],
-    ) -> tuple[Stands, Seen] | None:
+        placed: list[tuple[Stands, VisiblePoints]],
+    ) -> tuple[Stands, VisiblePoints] | None:
         """Return the first that is seen and leaves the others in view; None for none.
 
         Of the others, `placed` then has what is left in view.
         """
-        for own, seen in self._views(stands, surroundings, eyes):
+        for own, points in self._views(stands, surroundings, eyes):
             for other, _ in placed:
-                seen = seen.without(other)
-            if not self._long_enough(seen, surroundings.period):
+                points = points.without(other)
+            if not self._long_enough(points, surroundings.period):
                 continue
             others = [(other, view.without(own)) for other, view in placed]
             if all(self._long_enough(v, surroundings.period) for _, v in others):
                 placed[:] = others
-                return own, seen
+                return own, points
         return None
 
     def _views(
         self, stands: Stands, surroundings: Surroundings, eyes: np.ndarray
-    ) -> Iterator[tuple[Stands, Seen]]:
+    ) -> Iterator[tuple[Stands, VisiblePoints]]:
         """Look at boxes, some at a time."""
         for start in range(0, len(stands), _LOOKED_AT):
             some = stands[start : start + _LOOKED_AT]
-            for row, seen in enumerate(look(surroundings, eyes, some)):
-                yield some[row : row + 1], seen
+            for row, points in enumerate(look(surroundings, eyes, some)):
+                yield some[row : row + 1], points
 
-    def _long_enough(self, seen: Seen, period: float) -> bool:
+    def _long_enough(self, points: VisiblePoints, period: float) -> bool:
         frames = math.ceil(self.view_s / period - 1e-6)
-        return int((seen.pixels() >= self.view_px).sum()) >= frames
+        return int((points.pixels() >= self.view_px).sum()) >= frames

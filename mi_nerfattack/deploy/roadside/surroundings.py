@@ -95,8 +95,8 @@ class Surroundings:
         ground = self.height(under.reshape(-1, 2)).reshape(under.shape[:2])
         flat = np.abs(ground - stands.ground[:, None]).max(1) < _FLAT_M
         around = stands.lattice(step, clearance)
-        seen = self.height(around.reshape(-1, 2)).reshape(around.shape[:2])
-        free = flat & np.isfinite(seen).all(1)
+        heights = self.height(around.reshape(-1, 2)).reshape(around.shape[:2])
+        free = flat & np.isfinite(heights).all(1)
         free[free] = ~self._crossed(stands[free], step, clearance)
         return free
 
@@ -124,8 +124,8 @@ class Surroundings:
         box = self.scene.bbox()
         sides = [np.linspace(box.min[i], box.max[i], 18)[1:-1] for i in range(2)]
         points = np.stack(np.meshgrid(*sides), -1).reshape(-1, 2)
-        seen = 100.0 - vertical_reach(self.scene, points, 100.0)
-        return float(seen.min()) - 0.1 if seen.min() > HIGHEST_M else 100.0
+        heights = 100.0 - vertical_reach(self.scene, points, 100.0)
+        return float(heights.min()) - 0.1 if heights.min() > HIGHEST_M else 100.0
 
     @cached_property
     def _kerbed(self) -> dict[str, bool]:
@@ -161,8 +161,8 @@ class Surroundings:
             z = np.broadcast_to(z, (*begin.shape[:2], 1))
             origin, target = (np.concatenate([part, z], -1) for part in (begin, end))
             way = (target - origin).reshape(-1, 3)
-            found = self._hit(origin.reshape(-1, 3), way, 1.0)
-            hit |= found.reshape(begin.shape[:2]).any(1)
+            hits = self._hit(origin.reshape(-1, 3), way, 1.0)
+            hit |= hits.reshape(begin.shape[:2]).any(1)
         return hit
 
     def _hit(self, origin: np.ndarray, way: np.ndarray, share: float) -> np.ndarray:

@@ -15,7 +15,7 @@ _NEAREST_M = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class VisiblePoints:
     """Points of one object that are seen in the frames of a drive, k of them.
 
     Attributes:
@@ -52,16 +52,16 @@ class Seen:
         touched[frame[first]] = count * (span / (span + 1)).prod(1)
         return touched
 
-    def without(self, box: Stands) -> Seen:
+    def without(self, box: Stands) -> VisiblePoints:
         """Leave out the points behind the first of some boxes."""
         rows = ~box.hides(self.eye, self.point)
-        parts = ("frame", "image", "eye", "point")
-        return replace(self, **{name: getattr(self, name)[rows] for name in parts})
+        names = ("frame", "image", "eye", "point")
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
 
 def look(
     surroundings: Surroundings, poses: np.ndarray, stands: Stands
-) -> Iterator[Seen]:
+) -> Iterator[VisiblePoints]:
     """Find the points of each box that the scene does not hide, box by box.
 
     Args:
@@ -82,4 +82,4 @@ def look(
     for row in range(len(stands)):
         mine = open_ & (box == row)
         where = image[box[mine], which[mine], frame[mine]]
-        yield Seen(len(poses), frame[mine], where, eye[mine], point[mine])
+        yield VisiblePoints(len(poses), frame[mine], where, eye[mine], point[mine])

@@ -49,12 +49,12 @@ class PoseError:
         if not self.moves_objects:
             return offsets
         draws = self._rng(seed).normal(size=1 + offsets.size)[1:].reshape(-1, 6)
-        found = offsets.copy()
-        found[:, :2] += self.placement_m * draws[:, :2]
+        moved = offsets.copy()
+        moved[:, :2] += self.placement_m * draws[:, :2]
         up = np.radians(self.turn_deg) * draws[:, 2:3] * [0.0, 0.0, 1.0]
         turned = Rotation.from_rotvec(up) * Rotation.from_rotvec(offsets[:, 3:])
-        found[:, 3:] = turned.as_rotvec()
-        return found
+        moved[:, 3:] = turned.as_rotvec()
+        return moved
 
     def mount(self, mount: CameraMount, seed: int) -> CameraMount:
         """Return a mount with a drive's error of pitch; without error, `mount`."""

@@ -87,7 +87,9 @@ class LateFrames(AbstractAround):
 
     def __init__(self, inside: AbstractEnvironment, periods: int) -> None:
         super().__init__(inside)
-        self._frames: deque[CameraFrame] = deque(maxlen=_whole("late", periods) + 1)
+        self._frames: deque[CameraFrame] = deque(
+            maxlen=_checked_periods("late", periods) + 1
+        )
 
     def step(self, control: Controls) -> CameraFrame:
         """Hold a control, and return the frame that arrives."""
@@ -147,7 +149,7 @@ class LateControls(AbstractAround):
 
     def __init__(self, inside: AbstractEnvironment, periods: int) -> None:
         super().__init__(inside)
-        self.periods = _whole("latency", periods)
+        self.periods = _checked_periods("latency", periods)
         self._controls: deque[Controls] = deque()
 
     def step(self, control: Controls) -> CameraFrame:
@@ -172,7 +174,7 @@ class LateControls(AbstractAround):
         return frame
 
 
-def _whole(name: str, periods: int) -> int:
+def _checked_periods(name: str, periods: int) -> int:
     if not isinstance(periods, int) or periods < 0:
         raise InputError(f"{name}: {periods!r}; a whole number of control periods")
     return periods

@@ -76,10 +76,10 @@ def total_of(sensor: SceneSensor, observation: Observation, start: mi.Float) -> 
         observation: what it observed.
         start: of :class:`Distances`.
     """
-    seen = getattr(observation.kept, "seen", None)
-    if seen is None:  # no fields
+    marches = getattr(observation.integrator_state, "marches", None)
+    if marches is None:  # no fields
         return March.zeros(dr.width(observation.linear))
-    return _of_pixels(sensor.camera, seen.total, start)
+    return _of_pixels(sensor.camera, marches.total, start)
 
 
 def take_apart(
@@ -88,19 +88,25 @@ def take_apart(
     """Take a frame apart; arguments as of :func:`total_of`."""
     total, shares = total_of(sensor, observation, start), []
     if sensor.layers:
-        parts = sensor.integrator.composite.shares(observation.kept.seen)
-        shares = [_of_pixels(sensor.camera, part, start) for part in parts]
+        marches = sensor.integrator.composite.shares(
+            observation.integrator_state.marches
+        )
+        shares = [_of_pixels(sensor.camera, march, start) for march in marches]
     own = [id(posed) for posed in sensor.objects]
     ids = [id(layer) for layer in sensor.layers]
     behind = March(observation.linear - total.radiance, 1 - total.opacity)
-    others = [part for k, part in zip(ids, shares, strict=True) if k not in own]
+    others = [march for k, march in zip(ids, shares, strict=True) if k not in own]
     return Layers(others, [shares[ids.index(k)] for k in own if k in ids], behind)
 
 
 def _of_pixels(camera: Any, layer: March, start: mi.Float) -> March:
     """Average a layer over the samples of pixels, with depths from the camera."""
-    parts = layer.radiance, layer.opacity, layer.moment + layer.opacity * start
-    return March(*(camera.average(part) for part in parts))
+    moment = layer.moment + layer.opacity * start
+    return March(
+        camera.average(layer.radiance),
+        camera.average(layer.opacity),
+        camera.average(moment),
+    )
 
 
 class SurrogateEnvironment(AbstractSimulation):
@@ -134,25 +140,27 @@ class SurrogateEnvironment(AbstractSimulation):
     def _frame(self, sensor: SceneSensor) -> CameraFrame:
         """Return the frame of one of the cameras."""
         state = to_state(self.state[None])
-        found = sensor.observe(state, self._steps)
-        distances = measure(sensor, found, state)
-        total = total_of(sensor, found, distances.start)
+        observation = sensor.observe(state, self._steps)
+        distances = measure(sensor, observation, state)
+        total = total_of(sensor, observation, distances.start)
         depth = dr.select(total.opacity >= OPAQUE, total.depth, distances.far)
-        shape = found.image.shape[1:3]
+        shape = observation.image.shape[1:3]
         shown = [id(layer) for layer in sensor.layers]
         can_split = all(id(posed) in shown for posed in sensor.objects)
         return CameraFrame(
-            np.round(255 * np.array(found.image)[0]).astype(np.uint8),
+            np.round(255 * np.array(observation.image)[0]).astype(np.uint8),
             depth.numpy().reshape(shape),
             mount_matrix(self.state[None, :3], sensor.mount)[0],
-            found.linear.numpy().T.reshape(*shape, 3),
-            partial(_split, sensor, found, distances, shape) if can_split else None,
+            observation.linear.numpy().T.reshape(*shape, 3),
+            partial(_split, sensor, observation, distances, shape)
+            if can_split
+            else None,
         )
 
 
 def _split(
     sensor: SceneSensor,
-    found: Observation,
+    observation: Observation,
     distances: Distances,
     shape: tuple[int, int],
     objects: Sequence[str],
@@ -161,17 +169,17 @@ def _split(
 
     Args:
         sensor: that observed.
-        found: what it observed.
+        observation: what it observed.
         distances: of its rays.
         shape: height and width.
         objects: names.
     """
-    layers = take_apart(sensor, found, distances.start)
+    layers = take_apart(sensor, observation, distances.start)
     names = [f"scene{k or ''}" for k in range(len(layers.others))]
-    parts = zip((*names, *objects), layers.others + layers.objects, strict=True)
+    pairs = zip((*names, *objects), layers.others + layers.objects, strict=True)
     images = {}
-    for name, part in parts:
-        images |= part.images(name, shape)
+    for name, layer in pairs:
+        images |= layer.images(name, shape)
     images |= layers.behind.images("background", shape)
     far = dr.select(layers.behind.opacity > 0, distances.far, dr.inf)
     return images | {"background.Z": far.numpy().reshape(shape)}

@@ -114,14 +114,14 @@ def showing(
         known.get(id(item)) or _volume(item, next(free), id(item.field) in relit)
         for item in objects
     ]
-    parts = [*sensor.scene.shapes(), *_free_lights(sensor.scene)]
+    children = [*sensor.scene.shapes(), *_free_lights(sensor.scene)]
     options = {"stop": integrator.stop, "jitter": integrator.jitter}
     rule = next(k for k, v in COMPOSITES.items() if type(integrator.composite) is v)
     if integrator.relighting is not None:
         options["relit_samples"] = integrator.relighting.samples
     result = _see(
         Shown(others, shown, integrator.behind, {"composite": rule, **options}),
-        [camera.sensor, *parts],
+        [camera.sensor, *children],
         centred=camera.centred,
     )
     return result.seeing_as(sensor, mounts)
@@ -175,12 +175,12 @@ class Shown:
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
-def _see(shown: Shown, parts: Sequence[Any], **view: Any) -> SceneSensor:
+def _see(shown: Shown, children: Sequence[Any], **view: Any) -> SceneSensor:
     """Make a scene.
 
     Args:
         shown: by its integrator.
-        parts: its sensor first, shapes and lights.
+        children: its sensor first, shapes and lights.
         view: arguments of `SceneSensor`.
     """
     from mi_nerfattack.plugins.loaded import integrator_of  # of the variant
@@ -188,8 +188,8 @@ def _see(shown: Shown, parts: Sequence[Any], **view: Any) -> SceneSensor:
     volumes = [*shown.others, *shown.objects]
     integrator = integrator_of(volumes, shown.behind, _FIELDS, **shown.options)
     props = mi.Properties("scene")
-    for k, part in enumerate((integrator, *parts)):
-        props[f"part{k}"] = part
+    for k, child in enumerate((integrator, *children)):
+        props[f"part{k}"] = child
     try:
         scene: Any = mi.PluginManager.instance().create_object(props)
     except IndexError as err:  # Mitsuba does not give the shapes that it is made of

@@ -62,16 +62,16 @@ class MitsubaView(AbstractView):
             (height, width, 3) linear, exposed, and depth (height, width), metres along
             the ray; float32.
         """
-        parts = _parts(self.spp)
+        counts = _sample_counts(self.spp)
         seeds = [seed]
-        if len(parts) > 1:
+        if len(counts) > 1:
             sequence = np.random.SeedSequence(seed)
-            seeds = [int(value) for value in sequence.generate_state(len(parts))]
+            seeds = [int(value) for value in sequence.generate_state(len(counts))]
         views = [
-            self.renderer.render(camera_to_world, *part)
-            for part in zip(parts, seeds, strict=True)
+            self.renderer.render(camera_to_world, count, own_seed)
+            for count, own_seed in zip(counts, seeds, strict=True)
         ]
-        weights = np.array(parts, np.float32) / np.float32(self.spp)
+        weights = np.array(counts, np.float32) / np.float32(self.spp)
         rgb = sum(w * view.rgb for w, view in zip(weights, views, strict=True))
         gain = np.float32(2.0**self.exposure_ev)
         return np.asarray(gain * rgb), views[0].depth.copy()
@@ -80,11 +80,11 @@ class MitsubaView(AbstractView):
         """Nothing is held."""
 
 
-def _parts(spp: int) -> list[int]:
+def _sample_counts(spp: int) -> list[int]:
     """Split a number of samples into powers of two, the largest first."""
-    parts = [_PART] * (spp // _PART)
+    counts = [_PART] * (spp // _PART)
     size = _PART // 2
     while size:
-        parts += [size] * ((spp % _PART) // size % 2)
+        counts += [size] * ((spp % _PART) // size % 2)
         size //= 2
-    return parts
+    return counts

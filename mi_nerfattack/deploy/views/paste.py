@@ -84,10 +84,10 @@ class Paster:
         if not self.objects:
             return frame
         pose = frame.camera_to_world
-        found = paste_layers(frame.light, frame.depth, self.march(pose))
-        linear, depth, _ = found
-        image = linear_to_uint8(linear)
-        return CameraFrame(image, depth, pose, linear, partial(_split, *found))
+        layers = self.march(pose)
+        linear, depth, owner = paste_layers(frame.light, frame.depth, layers)
+        image, split = linear_to_uint8(linear), partial(_split, linear, depth, owner)
+        return CameraFrame(image, depth, pose, linear=linear, split=split)
 
     def _record(self, rays: Rays) -> list[March]:
         return [march(posed, rays, STOP) for posed in self.objects]
@@ -139,13 +139,13 @@ def _split(
     linear: np.ndarray, depth: np.ndarray, owner: np.ndarray, objects: Sequence[str]
 ) -> dict[str, np.ndarray]:
     """Give each pixel to the layer whose it is; see :meth:`CameraFrame.layers`."""
-    whole = np.concatenate([linear, np.ones((*depth.shape, 1), np.float32)], axis=-1)
-    found = {}
+    rgba = np.concatenate([linear, np.ones((*depth.shape, 1), np.float32)], axis=-1)
+    layers = {}
     for index, name in enumerate(("scene", *objects)):
         own = owner == index
-        found[name] = np.where(own[..., None], whole, np.float32(0))
-        found[f"{name}.Z"] = np.where(own, depth, np.inf)
-    return found
+        layers[name] = np.where(own[..., None], rgba, np.float32(0))
+        layers[f"{name}.Z"] = np.where(own, depth, np.inf)
+    return layers
 
 
 class AbstractView(ABC):

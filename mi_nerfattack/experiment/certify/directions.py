@@ -19,7 +19,7 @@ from mi_nerfattack.experiment.run_folder import (
     read_finished,
 )
 from mi_nerfattack.experiment.transfer.found import check_unchanged
-from mi_nerfattack.io.resumable import Unit, array_digest, misfits_told
+from mi_nerfattack.io.resumable import Unit, array_digest, misfits_reported
 from mi_nerfattack.render.posed import move_all
 from mi_nerfattack.rollout.function import Evaluation, Rollout
 from mi_nerfattack.rollout.loop import OnStep
@@ -75,8 +75,8 @@ class Ended:
         path, identity = folder / CHECKPOINT, scenario.identity()
         check_unchanged(path, identity)
         format_alone = {"format": CHECKPOINT_FORMAT}
-        kept = Unit(path, format_alone, CheckpointRecord, "").read(force=True)
-        if kept is None:
+        checkpoint = Unit(path, format_alone, CheckpointRecord, "").read(force=True)
+        if checkpoint is None:
             raise InputError(f"{path}: is missing; make the attack again")
         world = build_world(scenario, scenario.build_policy())
         freedom, rows = scenario.attack.freedom.build(), []
@@ -84,8 +84,8 @@ class Ended:
             rows = [_rows(freedom.colouring(field)) for field in world.fields]
         attack = build_attack(world)
         assert isinstance(attack, GradientAttack), "its method needs derivatives"
-        with misfits_told(path):
-            attack.load_tensors(kept.tensors)
+        with misfits_reported(path):
+            attack.load_tensors(checkpoint.tensors)
         return cls(world, attack, attack.best, rows, freedom.pose_rate is not None)
 
     @property
@@ -102,8 +102,8 @@ class Ended:
     @property
     def horizons(self) -> list[int]:
         """Control periods up to which gradients are compared, increasing."""
-        whole = self.attack.rollout.horizon
-        return sorted({max(1, round(share * whole)) for share in SHARES})
+        horizon = self.attack.rollout.horizon
+        return sorted({max(1, round(share * horizon)) for share in SHARES})
 
     def install(self, change: Parameters) -> None:
         """Show the best parameters with a change; none where it is empty."""
@@ -117,18 +117,18 @@ class Ended:
     def gradient(self, horizon: int, on_step: OnStep | None = None) -> Parameters:
         """Differentiate the objective of the first periods at the best parameters."""
         self.install({})
-        whole, sensor = self.rollout, self.attack.sensor
-        objective = truncated(whole.objective, horizon)
-        rollout = replace(whole, horizon=horizon, objective=objective)
+        full_rollout, sensor = self.rollout, self.attack.sensor
+        objective = truncated(full_rollout.objective, horizon)
+        rollout = replace(full_rollout, horizon=horizon, objective=objective)
         evaluation = rollout.run(self.attack.initial, on_step)
         moved = sensor.pose_keys if self.moves else ()
-        found = rollout.gradient(evaluation, moved, on_step=on_step)
+        gradients = rollout.gradient(evaluation, moved, on_step=on_step)
         values = {
-            f"{number}": found.textures[number].numpy()[rows]
+            f"{number}": gradients.textures[number].numpy()[rows]
             for number, rows in enumerate(self.rows)
         }
         if self.moves:
-            by_offsets = offset_gradients(sensor, found)
+            by_offsets = offset_gradients(sensor, gradients)
             values[OFFSETS] = by_offsets * self.attack.freedom.mask
         return values
 
@@ -163,8 +163,8 @@ class Ended:
         """Drive a closed loop with a change; return the objective of each horizon."""
         self.install(change)
         rollout = replace(self.rollout, camera_path=None)
-        seen = rollout.measure(self.attack.initial, on_step)
-        return np.array([cost_until(rollout, seen, h) for h in self.horizons])
+        evaluation = rollout.measure(self.attack.initial, on_step)
+        return np.array([cost_until(rollout, evaluation, h) for h in self.horizons])
 
 
 def _rows(colouring: AbstractColouring) -> Any:
@@ -172,11 +172,11 @@ def _rows(colouring: AbstractColouring) -> Any:
     return colouring.level.vertices if isinstance(colouring, Colours) else slice(None)
 
 
-def cost_until(rollout: Rollout, seen: Evaluation, horizon: int) -> float:
+def cost_until(rollout: Rollout, evaluation: Evaluation, horizon: int) -> float:
     """Return the objective of the first control periods of drives."""
     import mitsuba as mi
 
-    drive = seen.trajectory
+    drive = evaluation.trajectory
     states = drive.states_numpy()[:, 1 : horizon + 1, : drive.rows]
     costs = truncated(rollout.objective, horizon).costs(states, drive.dt)
     return float(rollout.reduction.reduce(mi.Float64(costs))[0])

@@ -61,7 +61,7 @@ class Differences(AbstractWork):
         identity: what decides about all of them.
         directions: random ones.
         step: to each side, in units of the drawn directions, see `Ended.drawn`.
-        here: the attack of this process; another process takes it up itself.
+        ended: the attack of this process; another process takes it up itself.
     """
 
     folder: Path
@@ -70,11 +70,11 @@ class Differences(AbstractWork):
     identity: Mapping[str, str]
     directions: int
     step: float
-    here: Ended | None
+    ended: Ended | None
 
     def open(self) -> Ended:
         """Take up the attack, unless it is there."""
-        return self.here or Ended.of(self.run, self.scenario)
+        return self.ended or Ended.of(self.run, self.scenario)
 
     def do(self, opened: Ended, index: int, report: OnUnits) -> None:
         """Predict and drive to both sides; a unit is a direction."""
@@ -97,31 +97,33 @@ class Differences(AbstractWork):
     def gradients(self, opened: Ended) -> list[dict[str, np.ndarray]]:
         """Return the gradient of each horizon; computed once for all processes."""
         unit, horizons = self._unit("gradients"), opened.horizons
-        kept = unit.read()
-        if kept is None:
+        content = unit.read()
+        if content is None:
             files.make_folder(self.folder)
-            found = [opened.gradient(horizon) for horizon in horizons]
-            named = zip(horizons, found, strict=True)
+            gradients = [opened.gradient(horizon) for horizon in horizons]
+            named = zip(horizons, gradients, strict=True)
             tensors = {f"{h}.{k}": v for h, one in named for k, v in one.items()}
             unit.write(tensors, Measured())
-            kept = unit.read()
-            assert kept is not None, "it was written"
+            content = unit.read()
+            assert content is not None, "it was written"
         keys = opened.drawn(0)
-        return [{key: kept.tensors[f"{h}.{key}"] for key in keys} for h in horizons]
+        return [{key: content.tensors[f"{h}.{key}"] for key in keys} for h in horizons]
 
     def read(self, index: int) -> tuple[np.ndarray, np.ndarray] | None:
         """Return predicted and real changes (horizons,); None where there are none."""
-        kept = self._unit(self._name(index)).read()
+        content = self._unit(self._name(index)).read()
         return (
-            None if kept is None else (kept.tensors["predicted"], kept.tensors["real"])
+            None
+            if content is None
+            else (content.tensors["predicted"], content.tensors["real"])
         )
 
     def remove_others(self, count: int) -> None:
         """Remove files of other runs and steps, and of further directions."""
         names = ["gradients", *(self._name(index) for index in range(count))]
-        wanted = {self._unit(name).path for name in names}
+        paths = {self._unit(name).path for name in names}
         for path in self.folder.glob("*.safetensors"):
-            if path not in wanted:
+            if path not in paths:
                 path.unlink()
 
     def _name(self, index: int) -> str:
@@ -134,7 +136,7 @@ class Differences(AbstractWork):
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the attack behind, whose world no process can send."""
-        return {**self.__dict__, "here": None}
+        return {**self.__dict__, "ended": None}
 
 
 def certify_gradient(
@@ -179,7 +181,7 @@ def certify_gradient(
             identity=identity,
             directions=directions,
             step=step,
-            here=ended,
+            ended=ended,
         )
         on_stage("differentiating", 0, 1)
         with one_thread(), deterministic(scenario.attack.deterministic):
@@ -199,10 +201,10 @@ def certify_gradient(
 
 def _document(work: Differences, ended: Ended) -> dict[str, Any]:
     """Summarise differences."""
-    found = [work.read(index) for index in range(work.directions + 1)]
-    if any(item is None for item in found):
+    changes = [work.read(index) for index in range(work.directions + 1)]
+    if any(item is None for item in changes):
         raise InputError(f"{work.folder}: a difference is missing; it was removed")
-    predicted, real = np.array(found).transpose(1, 2, 0)  # (horizons, directions + 1)
+    predicted, real = np.array(changes).transpose(1, 2, 0)  # (horizons, directions + 1)
     dt, rows = ended.world.scenario.vehicle.dt_s, []
     for number, horizon in enumerate(ended.horizons):
         p, r = predicted[number], real[number]
@@ -294,8 +296,8 @@ def _write(output: Path, document: Mapping[str, Any]) -> None:
             strict=True,
         )
         for number, (predicted, real) in enumerate(pairs):
-            about = {"direction": number, "periods": row["periods"]}
-            changes.append(about | {"predicted": predicted, "real": real})
+            labels = {"direction": number, "periods": row["periods"]}
+            changes.append(labels | {"predicted": predicted, "real": real})
     write_csv(output / TABLE, pd.DataFrame(table))
     write_csv(output / DIFFERENCES_TABLE, pd.DataFrame(changes))
     plot_gradient(output / PICTURE, document)

@@ -48,8 +48,8 @@ class Looks:
                 "attack.freedom.kind: 'pose'; a certificate is of textures, set it to "
                 "'texture'"
             )
-        found = [freedom.colouring(field) for field in world.fields]
-        colourings = [item for item in found if isinstance(item, Colours)]
+        all_colourings = [freedom.colouring(field) for field in world.fields]
+        colourings = [item for item in all_colourings if isinstance(item, Colours)]
         self._basis = LowFrequency(colourings, coefficients)
         self._offsets = world.appearance().offsets
 
@@ -153,7 +153,7 @@ class Smoothing:
             seed=draw.seed,
             steps=self.steps,
             identity={**self.identity, **flatten("drive", decided)},
-            how=Shown(draw.start, point, digest),
+            context=Shown(draw.start, point, digest),
         )
 
 
@@ -166,13 +166,14 @@ class NoisyDrives(AbstractDrives):
         scenario: of the drives.
         coefficients: of all objects together, at most.
         specs: of the drives.
-        here: world and appearances of this process; another process builds its own.
+        world_looks: world and appearances of this process; another process builds its
+            own.
     """
 
     scenario: Scenario
     coefficients: int
     specs: Sequence[DriveSpec]
-    here: tuple[World, Looks] | None
+    world_looks: tuple[World, Looks] | None
 
     @cached_property
     def groups(self) -> Sequence[Sequence[DriveSpec]]:
@@ -181,14 +182,15 @@ class NoisyDrives(AbstractDrives):
 
     def open(self) -> CaseDriver:
         """Build the world, unless it is there."""
-        if self.here is not None:
-            return CaseDriver(*self.here)
+        if self.world_looks is not None:
+            world, looks = self.world_looks
+            return CaseDriver(world, looks)
         world = build_world(self.scenario, self.scenario.build_policy())
         return CaseDriver(world, Looks(world, self.coefficients))
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the world behind, which no process can send."""
-        return {**self.__dict__, "here": None}
+        return {**self.__dict__, "world_looks": None}
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,9 +245,9 @@ class Searches(AbstractWork):
     def _judged(self, point: np.ndarray) -> float:
         values = []
         for spec in self._specs(point):
-            if (kept := self.drives.store.read(spec)) is None:
+            if (finished := self.drives.store.read(spec)) is None:
                 path = self.drives.store.path(spec)
                 raise InputError(f"{path}: missing; it was removed")
-            largest = float(kept.drive.distance_m.max())
+            largest = float(finished.drive.distance_m.max())
             values.append(severity(largest, self.limit_m))
         return float(np.mean(values))

@@ -102,15 +102,15 @@ class _Job:
         return Lane.of(self.world.route, self.world.scenario.vehicle.width_m)
 
     def work(self, specs: Sequence[DriveSpec] = ()) -> NoisyDrives:
-        count, here = self.settings.coefficients, (self.world, self.looks)
-        return NoisyDrives(self.store, self.world.scenario, count, specs, here)
+        count, world_looks = self.settings.coefficients, (self.world, self.looks)
+        return NoisyDrives(self.store, self.world.scenario, count, specs, world_looks)
 
     def drive(self, stage: str, specs: Sequence[DriveSpec]) -> list[Finished]:
         def progress(done: int, total: int) -> None:
             self.on_stage(stage, done, total)
 
-        found = run_drives(self.work(specs), self.workers, progress)
-        return [item for [item] in found]
+        groups = run_drives(self.work(specs), self.workers, progress)
+        return [item for [item] in groups]
 
     def centre(self) -> tuple[list[Finished], np.ndarray]:
         """Drive around the original textures; return the direction of severity, too."""
@@ -118,17 +118,17 @@ class _Job:
         numbers = range(self.settings.runs)
         draws = [smoothing.draw(self.world, CENTRE, k) for k in numbers]
         specs = [smoothing.spec(zero, draw, RANDOM, k) for k, draw in enumerate(draws)]
-        found = self.drive("driving under noise", specs)
-        severities = [self.severity(item) for item in found]
+        finished = self.drive("driving under noise", specs)
+        severities = [self.severity(item) for item in finished]
         noise = np.array([draw.noise for draw in draws])
-        return found, steepest(noise, np.array(severities))
+        return finished, steepest(noise, np.array(severities))
 
     def severity(self, item: Finished) -> float:
         return severity(float(item.drive.distance_m.max()), self.lane.wheel_m)
 
-    def departed(self, found: Sequence[Finished]) -> int:
+    def departed(self, finished: Sequence[Finished]) -> int:
         limit = self.lane.wheel_m
-        return sum(bool(item.drive.departed(limit).any()) for item in found)
+        return sum(bool(item.drive.departed(limit).any()) for item in finished)
 
     def search(self, direction: np.ndarray) -> list[np.ndarray]:
         """Search in the ball of each radius; return the best coefficients."""
@@ -162,8 +162,10 @@ class _Job:
             for point in points
             for k, draw in enumerate(draws)
         ]
-        found = self.drive("driving past attacks", specs)
-        each = [found[k : k + len(draws)] for k in range(0, len(found), len(draws))]
+        finished = self.drive("driving past attacks", specs)
+        each = [
+            finished[k : k + len(draws)] for k in range(0, len(finished), len(draws))
+        ]
         return [(items[:noisy], items[noisy:]) for items in each]
 
     def row(
@@ -171,10 +173,10 @@ class _Job:
         radius: float,
         bound: float,
         point: np.ndarray,
-        found: tuple[list[Finished], list[Finished]],
+        finished: tuple[list[Finished], list[Finished]],
     ) -> dict[str, Any]:
         """Return the figures of a radius."""
-        noisy, plain = found
+        noisy, plain = finished
         departed, total = self.departed(noisy), len(noisy)
         ends = chance_interval(departed, total, self.settings.confidence)
         within = bound_within(bound, radius, self.settings.sd)
@@ -262,7 +264,7 @@ def _document(
         "chance_bound": bound,
         "drive_s": float(np.median([item.wall_s for item in centre])),
         "rows": [
-            job.row(radius, bound, point, found) for radius, point, found in radii
+            job.row(radius, bound, point, finished) for radius, point, finished in radii
         ],
     }
 
@@ -329,14 +331,15 @@ def _write(
     attacked: Sequence[tuple[list[Finished], list[Finished]]],
 ) -> None:
     lanes = {job.world.route.name: job.lane}
-    parts = [(0.0, CENTRE, centre)]
-    for radius, found in zip(job.settings.radii, attacked, strict=True):
-        parts += [
-            (radius, name, items) for name, items in zip(_PARTS, found, strict=True)
+    groups = [(0.0, CENTRE, centre)]
+    for radius, finished in zip(job.settings.radii, attacked, strict=True):
+        groups += [
+            (radius, name, items)
+            for name, items in zip(_GROUP_NAMES, finished, strict=True)
         ]
     tables = [
         drives_table([item.drive for item in items], lanes, radius=radius, around=name)
-        for radius, name, items in parts
+        for radius, name, items in groups
     ]
     write_csv(output / DRIVES_TABLE, pd.concat(tables))
     rows = [{k: v for k, v in row.items() if k != "attack"} for row in document["rows"]]
@@ -347,4 +350,4 @@ def _write(
     files.write_json(output / DOCUMENT, document)
 
 
-_PARTS = ("attack", "attack without noise")
+_GROUP_NAMES = ("attack", "attack without noise")

@@ -51,8 +51,8 @@ def scene_field(world: World) -> PosedField | None:
     """Return the field of the scene; None where it has another surrogate."""
     objects = world.surrogate.objects
     layers = [item for item in world.surrogate.layers if item not in objects]
-    found = layers[0] if len(layers) == 1 else None
-    return found if isinstance(found, PosedField) else None
+    layer = layers[0] if len(layers) == 1 else None
+    return layer if isinstance(layer, PosedField) else None
 
 
 def fit_findings(world: World) -> Iterator[str]:
@@ -112,16 +112,16 @@ def likeness_findings(
     with np.errstate(invalid="ignore"):
         height = pose[2, 3] + theirs * upwards.reshape(theirs.shape)
         standing = height > _STANDING_M
-    seen = standing & np.isfinite(ours) & (theirs < _FARTHEST_M)
-    if seen.sum() < _FEWEST:
+    mask = standing & np.isfinite(ours) & (theirs < _FARTHEST_M)
+    if mask.sum() < _FEWEST:
         return
-    change = float(np.median(np.abs(np.log(ours[seen] / theirs[seen]))))
+    change = float(np.median(np.abs(np.log(ours[mask] / theirs[mask]))))
     if change > np.log1p(DEPTHS):
         yield (
             f"surrogate and {label} do not show one place: at the start, half of what "
             f"stands there is {100 * np.expm1(change):.0f} % or more nearer or farther "
-            f"in one than in the other ({np.median(ours[seen]):.1f} and "
-            f"{np.median(theirs[seen]):.1f} m in the middle); compare their pictures, "
+            f"in one than in the other ({np.median(ours[mask]):.1f} and "
+            f"{np.median(theirs[mask]):.1f} m in the middle); compare their pictures, "
             "and correct the field's scene.to_world"
         )
 
@@ -267,18 +267,18 @@ def view_findings(world: World, first: Drive) -> Iterator[str]:
     original = world.appearance()
     try:
         for k, item in enumerate(world.scenario.objects):
-            seen, most = 0, 0.0
+            visible, most = 0, 0.0
             for step in steps:
                 own = world.fields[k : k + 1]
                 share = changeable_share(world, own, first.poses[step], int(step))
-                seen, most = seen + (share >= PIXELS), max(most, share)
-                if seen == needed:
+                visible, most = visible + (share >= PIXELS), max(most, share)
+                if visible == needed:
                     break
             else:
                 yield (
                     f"{item.id} is not in view: along the drive of "
                     f"{first.time_s[-1]:.1f} s its texture changes at most "
-                    f"{100 * most:.2f} % of the pixels, in {seen} of {len(steps)} "
+                    f"{100 * most:.2f} % of the pixels, in {visible} of {len(steps)} "
                     f"pictures {100 * PIXELS:g} % or more, and {needed} are needed; "
                     "move it into view, or the start towards it"
                 )

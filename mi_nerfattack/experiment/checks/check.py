@@ -47,7 +47,7 @@ from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import World
 
 _LONGEST_PX = 560  # of the pictures from above
-_CHASE = 400, 200, 75.0  # pixels and field of view
+_CHASE_PX, _CHASE_FOV_DEG = (400, 200), 75.0
 _SPP = 4
 
 
@@ -66,7 +66,7 @@ class Check:
     """
 
     world: World
-    on_progress: Callable[[str, int, int, str], None] = lambda *told: None
+    on_progress: Callable[[str, int, int, str], None] = lambda *progress: None
     refused: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
     cost: Cost | None = None
@@ -92,32 +92,42 @@ class Check:
         ]
         try:
             if drives:
-                self._told(self._drive)
+                self._attempt(self._drive)
             else:
                 self._take(route_findings(world))
                 self._take(place_findings(world))
             for label in world.labels:
                 if label not in self.frames:
-                    self._told(lambda label=label: self._environment(label))
+                    self._attempt(lambda label=label: self._environment(label))
         finally:
             self._open.close()
         base = self.frames.get(SURROGATE)
         if base is not None and world.scenario.attack.method.needs_derivatives:
-            self._told(lambda: self._slope(base))
+            self._attempt(lambda: self._slope(base))
         for label, frame in self.frames.items():
             if label != SURROGATE and base is not None:
                 camera, layout = world.surrogate.intrinsics, world.place.rig.layout
-                pair = first_frame(base, layout), first_frame(frame, layout)
-                found = likeness_findings(camera, *pair, label)
-                self.doubts += found
+                self.doubts += likeness_findings(
+                    camera,
+                    first_frame(base, layout),
+                    first_frame(frame, layout),
+                    label=label,
+                )
 
     def _slope(self, frame: CameraFrame) -> None:
         """Look whether the control has a derivative by the first image."""
         policy, loop = self.world.policy, self.world.loop(self.world.surrogate)
         numbers = loop.numbers(loop.initial(self.world.initial[:1]), 0)
-        given = policy_image(frame.image), loop.goal, policy.initial_memory(1)
-        control, _ = policy.step(*given, numbers)
-        d_image, *_ = policy.step_vjp(*given, 0 * control + 1, (), numbers)
+        image, memory = policy_image(frame.image), policy.initial_memory(1)
+        control, _ = policy.step(image, loop.goal, memory, numbers=numbers)
+        d_image, *_ = policy.step_vjp(
+            image,
+            loop.goal,
+            memory,
+            cotangent=0 * control + 1,
+            d_memory=(),
+            numbers=numbers,
+        )
         if not d_image.numpy().any():
             self.doubts.append(
                 "the derivative of the policy's control by the first image is exactly "
@@ -148,7 +158,7 @@ class Check:
         world = self.world
         driven = {x for x in world.labels if not world.is_open_loop(x)}
         if self._period_s.keys() >= driven:
-            self._told(self._price)
+            self._attempt(self._price)
 
     def _price(self) -> None:
         self.on_progress("timing the attack", 0, 1, "")
@@ -165,13 +175,23 @@ class Check:
             self.on_progress(f"driving: {label}, run {run}", step + 1, horizon, "")
 
         start, seed = world.initial[run], world.scenario.seed + run
-        how = world.policy, world.route, start, seed, horizon, on_step, case, run, label
-        found = drive(self._environment(label), *how)
+        driven = drive(
+            self._environment(label),
+            world.policy,
+            world.route,
+            start,
+            seed,
+            horizon,
+            on_step,
+            case,
+            run,
+            label,
+        )
         self._period_s[label] = float(np.median(np.diff(times)))
-        self.drives.append(found)
-        return found
+        self.drives.append(driven)
+        return driven
 
-    def _told(self, work: Callable[[], object]) -> bool:
+    def _attempt(self, work: Callable[[], object]) -> bool:
         """Do something whose error is a reason to refuse; tell whether it is done."""
         try:
             work()
@@ -208,7 +228,7 @@ class Check:
 
     def picture(self, path: Path) -> bool:
         """Write the picture of the scenario; tell whether it could be drawn."""
-        return self._told(lambda: self._picture(path))
+        return self._attempt(lambda: self._picture(path))
 
     def _picture(self, path: Path) -> None:
         world = self.world
@@ -229,16 +249,17 @@ class Check:
             name = f"{world.scenario.scene.deployment.file.name}, from above"
             bare = scene_above(scene, overhead, near, _SPP)
             grounds[name] = Paster(overhead.camera, objects).paste(bare).image
-            camera, mount = from_fov(*_CHASE), chase_mount(overlay.car_width_m)
+            camera = from_fov(*_CHASE_PX, _CHASE_FOV_DEG)
+            mount = chase_mount(overlay.car_width_m)
             view = MitsubaView(scene, camera, _SPP)
             view.show(objects)
             pose = mount_matrix(world.initial[:1], mount)[0]
             behind = view.render(pose, 0).image
             looks["Start, from behind the car"] = Look(behind, camera, pose, True)
-        told = [f"REFUSED: {line}" for line in self.refused]
-        told += [f"LOOK AT: {line}" for line in self.doubts]
+        lines = [f"REFUSED: {line}" for line in self.refused]
+        lines += [f"LOOK AT: {line}" for line in self.doubts]
         name = world.scenario.name
-        place_picture(path, overlay, overhead, grounds, looks, told, name)
+        place_picture(path, overlay, overhead, grounds, looks, lines, name)
 
     def _overlay(self) -> Overlay:
         world = self.world

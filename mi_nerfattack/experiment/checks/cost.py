@@ -97,8 +97,8 @@ def estimate(world: World, drive_s: Mapping[str, float]) -> Cost:
     drives = sum(n * drive_s.get(label, 0.0) for label, n in periods.items())
     passes = count + 3  # attribution is about three more
     wall = passes * iteration + horizon * ((looks + 1) * forward + drives)
-    kept = isinstance(section.adjoint, KeptBackgrounds)
-    again = 1 if kept or not backward else 2
+    keeps_backgrounds = isinstance(section.adjoint, KeptBackgrounds)
+    again = 1 if keeps_backgrounds or not backward else 2
     frames = section.poses * (again * passes * rendered + (looks + 1) * horizon)
     frames += sum(periods.values()) * horizon
     return Cost(
@@ -107,7 +107,7 @@ def estimate(world: World, drive_s: Mapping[str, float]) -> Cost:
         horizon,
         frames,
         wall,
-        peak_memory_mb() + kept_mb(world),
+        peak_memory_mb() + backgrounds_mb(world),
         disk + _PICTURES_MB,
         {"forward": forward, "backward": backward, **drive_s},
     )
@@ -131,13 +131,18 @@ def _iteration(world: World) -> tuple[float, float, float, float]:
 
         attack.step(on_step)
         end = time.perf_counter()
-        kept = sum(value.nbytes for value in attack.tensors().values())
+        tensor_bytes = sum(value.nbytes for value in attack.tensors().values())
     finally:
         world.show(original)
     forward = (times[periods] - times[0]) / periods
     there = attack.sweeps * periods
     backward = (times[there] - times[periods]) / periods
-    return forward, backward, end - times[-1], (kept + _field_bytes(world)) / 1e6
+    return (
+        forward,
+        backward,
+        end - times[-1],
+        (tensor_bytes + _field_bytes(world)) / 1e6,
+    )
 
 
 def _field_bytes(world: World) -> int:
@@ -150,7 +155,7 @@ def _field_bytes(world: World) -> int:
     return total
 
 
-def kept_mb(world: World) -> float:
+def backgrounds_mb(world: World) -> float:
     """Return what `kept_backgrounds` keeps for all periods but the timed ones, in MB.
 
     The estimate is made from four frames along the route.
@@ -160,9 +165,9 @@ def kept_mb(world: World) -> float:
         return 0.0
     period = world.scenario.vehicle.dt_s
     first, last = world.scenario.drive.stretch(world.route, period)
-    loop, kept = world.loop(sensor), 0
+    loop, total_bytes = world.loop(sensor), 0
     for share in _ALONG:
         pose = world.route.pose_at(first + share * (last - first))
         state = loop.initial(np.tile(pose, (section.poses, 1)))
-        kept += allocated_bytes(sensor.keep(sensor.observe(state, 0)))
-    return kept / len(_ALONG) * max(0, world.horizon - _PERIODS) / 1e6
+        total_bytes += allocated_bytes(sensor.keep(sensor.observe(state, 0)))
+    return total_bytes / len(_ALONG) * max(0, world.horizon - _PERIODS) / 1e6

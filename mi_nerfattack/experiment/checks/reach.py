@@ -141,11 +141,11 @@ class ReachSensor(AbstractSensor):
         limits = np.minimum(low, image)[_FRAMES], np.maximum(high, image)[_FRAMES]
         cotangent = np.zeros((len(_SIGNS), self.controls))
         cotangent[:, 0] = _SIGNS
-        found, most = self.search.run(
+        extremes, most = self.search.run(
             self.policy, self.goal, image[_FRAMES], limits, cotangent
         )
         self.limits.append((_SIGNS * most)[:2])
-        return Observation(mi.TensorXf(np.concatenate([image[:1], found[2:]])), step)
+        return Observation(mi.TensorXf(np.concatenate([image[:1], extremes[2:]])), step)
 
     def _observe(self, textures: list[Any], state: Any, step: int) -> np.ndarray:
         self.sensor.set_textures(textures)

@@ -113,24 +113,24 @@ def lane_findings(
             low, high = low - freedom.limit_m, high + freedom.limit_m
         z = solid.points[:, 2]
         points = solid.points[(z > CAR_M[0]) & (z < CAR_M[1])]
-        found = _nearest(points[:, :2], route)
-        if found[1] < half:
-            at, distance, arc = found
+        nearest = _nearest(points[:, :2], route)
+        if nearest[1] < half:
+            at, distance, arc = nearest
             yield (
                 f"{solid.name} stands on the lane: {arc:.1f} m along route "
-                f"{route.name!r}, at {_told(at)}, it is {distance:.2f} m from the "
-                f"lane's centre, and the car needs {half:.2f} m to each side; move "
+                f"{route.name!r}, at {_coordinates(at)}, it is {distance:.2f} m from "
+                f"the lane's centre, and the car needs {half:.2f} m to each side; move "
                 "it aside"
             )
             continue
         if freedom.pose_rate is None:
             continue
-        found = _reached(solid.points[(z > low) & (z < high)], solid, route, freedom)
-        if found[1] < half:
+        reached = _reached(solid.points[(z > low) & (z < high)], solid, route, freedom)
+        if reached[1] < half:
             yield (
                 f"{solid.name} may move onto the lane: attack.pose_limit_m and "
-                f"pose_limit_deg let it come to {found[1]:.2f} m from the lane's "
-                f"centre, {found[2]:.1f} m along route {route.name!r}, and the car "
+                f"pose_limit_deg let it come to {reached[1]:.2f} m from the lane's "
+                f"centre, {reached[2]:.1f} m along route {route.name!r}, and the car "
                 f"needs {half:.2f} m to each side; lower them, or move it aside"
             )
 
@@ -142,13 +142,13 @@ def _nearest(points: np.ndarray, route: Route) -> tuple[Any, float, float]:
     """
     if not len(points):
         return None, math.inf, 0.0
-    found = route.project_numpy(np.pad(points, ((0, 0), (0, 1))))
-    distance = np.abs(found.cross_track)
+    projection = route.project_numpy(np.pad(points, ((0, 0), (0, 1))))
+    distance = np.abs(projection.cross_track)
     if not route.closed:
-        beside = (found.arc_length >= 0) & (found.arc_length <= route.length)
+        beside = (projection.arc_length >= 0) & (projection.arc_length <= route.length)
         distance = np.where(beside, distance, np.inf)
     i = int(distance.argmin())
-    return points[i], float(distance[i]), float(found.arc_length[i])
+    return points[i], float(distance[i]), float(projection.arc_length[i])
 
 
 def _reached(
@@ -158,18 +158,18 @@ def _reached(
     if not len(points):
         return _nearest(points, route)
     x, y, *_, yaw = freedom.mask
-    steps = _steps(x * freedom.limit_m), _steps(y * freedom.limit_m)
-    shifts = np.stack(np.meshgrid(*steps))
+    along_x, along_y = _steps(x * freedom.limit_m), _steps(y * freedom.limit_m)
+    shifts = np.stack(np.meshgrid(along_x, along_y))
     origin = solid.posed.placed.translation
     angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
     ways = np.stack([np.cos(angles), np.sin(angles)])
     outline = points[np.unique((points[:, :2] @ ways).argmax(0))] - origin
-    found = []
+    nearest = []
     for angle in yaw * freedom.limit_rad * np.linspace(-1, 1, 9):
         turned = outline @ Rotation.from_euler("z", angle).as_matrix().T + origin
         moved = turned[:, None, :2] + shifts.reshape(2, -1).T
-        found.append(_nearest(moved.reshape(-1, 2), route))
-    return min(found, key=lambda item: item[1])
+        nearest.append(_nearest(moved.reshape(-1, 2), route))
+    return min(nearest, key=lambda item: item[1])
 
 
 def _steps(limit: float) -> np.ndarray:
@@ -231,7 +231,7 @@ def _buried(
     what, remedy = ("the ground", "raise it") if up else ("a wall", "move it")
     return (
         f"{solid} reaches {depth[deepest]:.2f} m into {what} of {scene}, at "
-        f"{_told(points[deepest])}, where its texture is not seen; {remedy}"
+        f"{_coordinates(points[deepest])}, where its texture is not seen; {remedy}"
     )
 
 
@@ -256,12 +256,12 @@ def _entered(scene: Any, start: np.ndarray, points: np.ndarray) -> np.ndarray:
     begin, count = np.zeros(len(points)), np.zeros(len(points), int)
     for _ in range(_MOST_SURFACES):
         at = upload_rows(mi.Point3f, start + begin[:, None] * unit)
-        found = scene.ray_intersect(mi.Ray3f(at, direction))
-        t = begin + found.t.numpy()
+        hit = scene.ray_intersect(mi.Ray3f(at, direction))
+        t = begin + hit.t.numpy()
         met = t < length
         if not met.any():
             break
-        facing = (found.n.numpy().T * unit).sum(1)
+        facing = (hit.n.numpy().T * unit).sum(1)
         count += np.where(met, -np.sign(facing).astype(int), 0)
         begin = np.where(met, t + 1e-4, begin)
     return count
@@ -274,11 +274,11 @@ def _distances(scene: Any, points: np.ndarray) -> np.ndarray:
     ray = mi.Ray3f(
         upload_rows(mi.Point3f, origins), upload_rows(mi.Vector3f, directions)
     )
-    found = scene.ray_intersect_preliminary(ray, coherent=False)
-    return found.t.numpy().reshape(-1, 6)
+    hit = scene.ray_intersect_preliminary(ray, coherent=False)
+    return hit.t.numpy().reshape(-1, 6)
 
 
-def _told(point: np.ndarray) -> str:
+def _coordinates(point: np.ndarray) -> str:
     return f"({', '.join(f'{x:.1f}' for x in point.round(1) + 0)}) m"
 
 

@@ -11,11 +11,11 @@ import pandas as pd
 from scipy.stats import gmean
 
 from mi_nerfattack.drives.table import (
+    INTEGER,
     MAX_BYTES,
     NUMBER,
     TEXT,
     TRUTH,
-    WHOLE,
     read_csv,
     records,
     write_csv,
@@ -59,7 +59,7 @@ CASES = {
 #: Columns of the table, one row per drive.
 TABLE = {
     **dict.fromkeys(("attack", "environment", "condition", "case", "route"), TEXT),
-    "run": WHOLE,
+    "run": INTEGER,
     **dict.fromkeys(("cross_track_mean_m", "cross_track_max_m", "wheel_out_s"), NUMBER),
     "departed": TRUTH,
 }
@@ -85,36 +85,36 @@ def write_markdown(path: Path, folder: Path, tuning: Path | None = None) -> None
     """
     before, after = _around(path)
     if (folder / RESULTS).is_file():
-        parts = _of_sweep(folder, path.parent, tuning)
+        blocks = _of_sweep(folder, path.parent, tuning)
     elif (folder / DOCUMENT).is_file() or (folder / DRIVES).is_file():
-        parts = _of_transfer(folder, path.parent)
+        blocks = _of_transfer(folder, path.parent)
     else:
         raise InputError(
             f"{folder}: has neither {RESULTS} of a sweep nor {DOCUMENT} of a transfer, "
             "of which pages of Markdown are made; others are written as .html"
         )
-    files.write_text(path, "\n\n".join([before, *parts, after]))
+    files.write_text(path, "\n\n".join([before, *blocks, after]))
 
 
 def _around(path: Path) -> tuple[str, str]:
     """Return what stands before and after the figures, with the marks."""
     text = files.read_text(path) if path.exists() else f"# Figures\n\n{BEGIN}\n{END}\n"
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
+    before, begin, tail = text.partition(BEGIN)
+    _, end, after = tail.partition(END)
     if not (begin and end):
         raise InputError(f"{path}: has no lines {BEGIN!r} and {END!r}; write them")
     return before + begin, end + after
 
 
 def _of_sweep(folder: Path, output: Path, tuning: Path | None) -> list[str]:
-    found, made = summary_of(folder), read_made(folder)
-    parts = list(sections(found, made))
+    figures, made = summary_of(folder), read_made(folder)
+    blocks = list(sections(figures, made))
     copy_table(folder, output)
     if tuning is not None:
-        parts.insert(-1, settings(summary_of(tuning), methods_of(found)))
+        blocks.insert(-1, settings(summary_of(tuning), methods_of(figures)))
         copy_table(tuning, output / "tuning")
-    files.write_json(output / SUMMARY, found)
-    return parts
+    files.write_json(output / SUMMARY, figures)
+    return blocks
 
 
 def _of_transfer(folder: Path, output: Path) -> list[str]:
@@ -246,8 +246,8 @@ def settings(tuning: Figures, methods: Sequence[str]) -> str:
     """
     errors: dict[str, dict[str, float]] = {}
     for group in tuning["groups"]:
-        about = group["environment"], group["case"]
-        if about == (SURROGATE, ATTACK) and group["route"] is not None:
+        labels = group["environment"], group["case"]
+        if labels == (SURROGATE, ATTACK) and group["route"] is not None:
             own = errors.setdefault(group["method"], {})
             own[group["route"]] = group["cross_track_mean_m"]
     routes = list(dict.fromkeys(route for own in errors.values() for route in own))
@@ -271,11 +271,11 @@ def settings(tuning: Figures, methods: Sequence[str]) -> str:
 def _provenance(summary: Figures, made: Figures) -> str:
     """Return versions of programs, and digests of the files that the sweep used."""
     versions, contents = {}, {}
-    for about in made.values():
-        if about["versions"] is not None:
-            told = ", ".join(f"{k} {v}" for k, v in about["versions"].items())
-            versions[told] = None
-        for key, digest in about["digests"].items():
+    for record in made.values():
+        if record["versions"] is not None:
+            line = ", ".join(f"{k} {v}" for k, v in record["versions"].items())
+            versions[line] = None
+        for key, digest in record["digests"].items():
             if key != "scenario":
                 contents.setdefault(digest, key)
     attacks = summary["attacks"]
@@ -310,8 +310,8 @@ def transfer_sections(drives: pd.DataFrame) -> Iterator[str]:
     by = ["attack", "environment", "condition", "case"]
     cells: dict[tuple[str, ...], dict[str, Any]] = {}
     for figures in records(summary(drives, by, ["attack"])):
-        about = {name: figures[name] for name in by[:3]}
-        row = cells.setdefault(tuple(about.values()), about | {"cases": {}})
+        identity = {name: figures[name] for name in by[:3]}
+        row = cells.setdefault(tuple(identity.values()), identity | {"cases": {}})
         row["cases"][figures["case"]] = figures
     rows = list(cells.values())
     compare_rows(rows)
@@ -333,10 +333,10 @@ def transfer_sections(drives: pd.DataFrame) -> Iterator[str]:
 
 
 def _column(column: Mapping[str, Any]) -> Sequence[str]:
-    cases, transfer, kept = column["cases"], column["transfer"], ""
+    cases, transfer, transferred = column["cases"], column["transfer"], ""
     if transfer is not None:
         ends = percent(transfer["rate_ci95"])
-        kept = f"{transfer['kept']}/{transfer['of']}{ends}"
+        transferred = f"{transfer['kept']}/{transfer['of']}{ends}"
     ratio = column["ratio_to_surrogate"]
     return (
         column["condition"],
@@ -344,12 +344,12 @@ def _column(column: Mapping[str, Any]) -> Sequence[str]:
         cell(cases.get(ATTACK)),
         out(cases[ATTACK]) if ATTACK in cases else "",
         "" if ratio is None else f"{ratio:.2f}",
-        kept,
+        transferred,
     )
 
 
 def _error(row: Mapping[str, Any] | None) -> str:
     if row is None or ATTACK not in row["cases"]:
         return ""
-    told = f"{row['cases'][ATTACK]['cross_track_mean_m']:.3f}"
-    return f"**{told}**" if row["succeeds"] else told
+    error = f"{row['cases'][ATTACK]['cross_track_mean_m']:.3f}"
+    return f"**{error}**" if row["succeeds"] else error

@@ -29,7 +29,7 @@ from mi_nerfattack.render.posed import PosedField, object_footprints
 from mi_nerfattack.report.pages.elements import (
     ABOVE,
     COST,
-    SEEN,
+    FRAMES,
     SHOWN_CASES,
     TEXTURES,
     WHEN,
@@ -52,7 +52,7 @@ PICTURES: Mapping[str, Mapping[str, str]] = {
         "Cross-track error": "errors.png",
     },
     COST: {"Convergence of the attack": "convergence.png"},
-    SEEN: {"First-person frames": "strip.png"},
+    FRAMES: {"First-person frames": "strip.png"},
     WHEN: {
         "When the failure is made": "attribution.png",
         "Where the failure is made": "attribution_object.png",
@@ -76,24 +76,27 @@ def read_run(folder: Path, label: str, repeat: str | None = None) -> RunPart:
     scenario = folder / SCENARIO
     pictures = _pictures(folder, document)
     scrubbers = {
-        SEEN: _seen_scrubbers(folder, document),
+        FRAMES: _drive_scrubbers(folder, document),
         TEXTURES: _turntables(folder, document),
     }
     attack = f"mi-nerfattack attack {shlex.quote(str(scenario))} -o "
+    text = files.read_text(scenario)
+    made_with, digests = _provenance(folder)
     return RunPart(
         label,
         document,
-        files.read_text(scenario),
-        *_provenance(folder),
-        repeat or attack + "RUN",
-        pictures,
-        scrubbers,
-        _missing(pictures, scrubbers, f"{attack}{shlex.quote(str(folder))}"),
+        text,
+        made_with=made_with,
+        digests=digests,
+        repeat=repeat or attack + "RUN",
+        pictures=pictures,
+        scrubbers=scrubbers,
+        missing=_missing(pictures, scrubbers, f"{attack}{shlex.quote(str(folder))}"),
     )
 
 
 def _pictures(folder: Path, document: Mapping[str, Any]) -> dict[str, dict[str, Path]]:
-    found = {
+    pictures = {
         section: {
             title: folder / name
             for title, name in names.items()
@@ -102,12 +105,14 @@ def _pictures(folder: Path, document: Mapping[str, Any]) -> dict[str, dict[str, 
         for section, names in PICTURES.items()
     }
     if document["scenario"]["attack"]["freedom"]["kind"] == "pose":
-        found[WHEN] = {f"{k} ({UNCHANGED})": path for k, path in found[WHEN].items()}
+        pictures[WHEN] = {
+            f"{k} ({UNCHANGED})": path for k, path in pictures[WHEN].items()
+        }
     for name in document.get("replay") or {}:
         path = folder / f"controls_{name}.png"
         if path.is_file():
-            found[SEEN][f"Change of control in the recording, {name}"] = path
-    return found
+            pictures[FRAMES][f"Change of control in the recording, {name}"] = path
+    return pictures
 
 
 def _missing(
@@ -117,18 +122,20 @@ def _missing(
 ) -> dict[str, str]:
     """Say why sections are empty, and what fills them."""
     drawn = any(pictures.values())
-    found = {
+    reasons = {
         section: f"The run was made without pictures; this writes them: {resume}"
         for section, own in pictures.items()
         if not own
     }
-    if drawn and WHEN in found:
-        found[WHEN] = "The policy has no derivatives that would tell."
-    if drawn and not scrubbers[SEEN]:
-        found[SEEN] = f"There are no frames; this writes them: {resume} --pictures all"
+    if drawn and WHEN in reasons:
+        reasons[WHEN] = "The policy has no derivatives that would tell."
+    if drawn and not scrubbers[FRAMES]:
+        reasons[FRAMES] = (
+            f"There are no frames; this writes them: {resume} --pictures all"
+        )
     if not scrubbers[TEXTURES]:
-        found[TEXTURES] = "The folder has no objects; a new run writes them."
-    return found
+        reasons[TEXTURES] = "The folder has no objects; a new run writes them."
+    return reasons
 
 
 def _provenance(folder: Path) -> tuple[dict[str, str], dict[str, str]]:
@@ -136,22 +143,22 @@ def _provenance(folder: Path) -> tuple[dict[str, str], dict[str, str]]:
     path = folder / EFFORT
     if not path.is_file():
         return {}, {}
-    _, about = files.read_safetensors(path, ())
+    _, metadata = files.read_safetensors(path, ())
     made_with = {
         key: value
-        for key, value in sorted(about.items())
+        for key, value in sorted(metadata.items())
         if not key.startswith(("scenario.", "kept.")) and key != "format"
     }
     named = {
         key: json.loads(value)
-        for key, value in sorted(about.items())
+        for key, value in sorted(metadata.items())
         if key.startswith("scenario.") and '"sha256"' in value
     }
     digests = {
         f"{key.removeprefix('scenario.')}: {value['file']}": value["sha256"]
         for key, value in named.items()
     }
-    for key, value in sorted(about.items()):  # of other packages
+    for key, value in sorted(metadata.items()):  # of other packages
         if key.startswith("scenario.") and key.endswith(".package"):
             made_with[key.removeprefix("scenario.")] = json.loads(value)
     for key, value in named.items():
@@ -170,7 +177,7 @@ _FRAME = re.compile(r"([0-9]{4,})\.png")
 Errors = Mapping[int, tuple[float, float]]
 
 
-def _seen_scrubbers(folder: Path, document: Mapping[str, Any]) -> list[Scrubber]:
+def _drive_scrubbers(folder: Path, document: Mapping[str, Any]) -> list[Scrubber]:
     """Show drives without objects, past random textures and past the attack.
 
     There is one scrubber for each environment with frames.
@@ -179,8 +186,8 @@ def _seen_scrubbers(folder: Path, document: Mapping[str, Any]) -> list[Scrubber]
     names += document.get("replay") or {}
     errors = _read_errors(folder / "steps.csv")
     period = document["scenario"]["vehicle"]["dt_s"]
-    found = [_seen(folder, name, errors, period) for name in names]
-    return [scrubber for scrubber in found if scrubber is not None]
+    scrubbers = [_drive_scrubber(folder, name, errors, period) for name in names]
+    return [scrubber for scrubber in scrubbers if scrubber is not None]
 
 
 def _turntables(folder: Path, document: Mapping[str, Any]) -> list[Scrubber]:
@@ -197,7 +204,7 @@ def _turntables(folder: Path, document: Mapping[str, Any]) -> list[Scrubber]:
     return [Scrubber(title, tuple(panes), 0, TURN_S / VIEWS)] if panes else []
 
 
-def _seen(
+def _drive_scrubber(
     folder: Path,
     environment: str,
     errors: Mapping[tuple[str, str], Errors],
@@ -250,12 +257,12 @@ def _difference(one: Path | None, other: Path | None) -> float:
 def _frames(folder: Path, environment: str, case: str) -> dict[int, Path]:
     """Return the frames of a drive by the control periods before them."""
     own = folder / "frames" / f"{environment}_{case}"
-    found = {
+    frames = {
         int(match[1]): path
         for path in (own.iterdir() if own.is_dir() else ())
         if (match := _FRAME.fullmatch(path.name))
     }
-    return dict(sorted(found.items()))
+    return dict(sorted(frames.items()))
 
 
 def _pane(
@@ -284,13 +291,13 @@ def _pane(
 
 def _read_errors(path: Path) -> dict[tuple[str, str], dict[int, tuple[float, float]]]:
     """Read where first drives were, by environment and case; nothing without a file."""
-    found: dict[tuple[str, str], dict[int, tuple[float, float]]] = {}
+    errors: dict[tuple[str, str], dict[int, tuple[float, float]]] = {}
     table = read_csv(path, STEPS, FURTHER) if path.is_file() else pd.DataFrame()
     for row in records(table):
         if row["run"] == 0:
-            own = found.setdefault((row["environment"], row["case"]), {})
+            own = errors.setdefault((row["environment"], row["case"]), {})
             own[row["step"]] = row["time_s"], row["cross_track_m"]
-    return found
+    return errors
 
 
 def draw_above(path: Path, folders: Sequence[Path]) -> None:

@@ -37,8 +37,8 @@ def read_sweep(
     """
     table = read_table(folder / RESULTS)
     cells, known = folder / CELLS, table["cell"].unique()
-    told = read_attacks(folder, table)
-    sections = {one["cell"]: one["section"] for one in told if "section" in one}
+    attack_rows = read_attacks(folder, table)
+    sections = {one["cell"]: one["section"] for one in attack_rows if "section" in one}
     notes = []
     begun = [path for path in cells.glob("*/") if not (path / COMPLETE).exists()]
     if begun:
@@ -54,7 +54,7 @@ def read_sweep(
     attacks = _attacks(folder, table, sections)
     return SweepPart(
         label,
-        summarise(table, told),
+        summarise(table, attack_rows),
         attacks,
         _shown(cells, [row for row in attacks if row["cell"] in sections], on_run),
         _pictures(cells, table, sections, Path(tempfile.mkdtemp(dir=scratch)), notes),
@@ -73,9 +73,9 @@ def _attacks(
         `section` (`attack` of its scenario, None without its folder), and `repeat`, a
         command.
     """
-    found = []
+    rows = []
     for _, own in table.groupby(["cell", "environment"], sort=False, dropna=False):
-        [about] = records(own[[*LABELS, "environment", "error"]].head(1))
+        [row] = records(own[[*LABELS, "environment", "error"]].head(1))
         cases = {case: own[own["case"] == case] for case in SHOWN_CASES}
         means = {
             case: float(drives["cross_track_mean_m"].mean())
@@ -84,14 +84,14 @@ def _attacks(
         }
         attack = cases[ATTACK]["wheel_out_s"]
         out_s = float(attack.mean()) if len(attack) else None
-        name = f"{about['cell']}:{about['environment']}:{ATTACK}:0"
+        name = f"{row['cell']}:{row['environment']}:{ATTACK}:0"
         words = ["mi-nerfattack", "reproduce", str(folder), name]
-        if about["error"] is not None:
+        if row["error"] is not None:
             words = []
-        about |= {"cases": means, "wheel_out_s": out_s}
-        about["section"] = sections.get(about["cell"])
-        found.append(about | {"repeat": shlex.join(words)})
-    return found
+        row |= {"cases": means, "wheel_out_s": out_s}
+        row["section"] = sections.get(row["cell"])
+        rows.append(row | {"repeat": shlex.join(words)})
+    return rows
 
 
 def _shown(
@@ -103,7 +103,7 @@ def _shown(
         if row["environment"] == SURROGATE and ATTACK in row["cases"]:
             key = row["route"], row["method"], row["budget"]
             groups.setdefault(key, []).append(row)
-    found = []
+    runs = []
     for key, own in groups.items():
         ordered = sorted(own, key=lambda row: row["cases"][ATTACK])
         middle = ordered[len(ordered) // 2]
@@ -111,8 +111,8 @@ def _shown(
         label += f", {middle['objects']}, seed {middle['seed']}"
         label += f" (the middle one of {len(own)})"
         on_run(label)
-        found.append(read_run(cells / middle["cell"], label, middle["repeat"]))
-    return found
+        runs.append(read_run(cells / middle["cell"], label, middle["repeat"]))
+    return runs
 
 
 def _pictures(
@@ -123,15 +123,15 @@ def _pictures(
     notes: list[str],
 ) -> dict[str, Path]:
     """Plot the drives of all cells of each route and method from above."""
-    found = {}
-    here = table[table["cell"].isin(list(present))]
-    for (route, method), own in here.groupby(["route", "method"], sort=False):
+    pictures = {}
+    rows = table[table["cell"].isin(list(present))]
+    for (route, method), own in rows.groupby(["route", "method"], sort=False):
         name, folders = f"{route}, {method}", [cells / c for c in own["cell"].unique()]
-        path = scratch / f"above_{len(found)}.png"
+        path = scratch / f"above_{len(pictures)}.png"
         try:
             draw_above(path, folders)
         except InputError as err:  # scenarios name files of the machine that made them
             notes.append(f"No drives from above of {name}: {err}")
         else:
-            found[f"First drives of all attacks: {name}, n = {len(folders)}"] = path
-    return found
+            pictures[f"First drives of all attacks: {name}, n = {len(folders)}"] = path
+    return pictures

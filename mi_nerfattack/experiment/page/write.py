@@ -19,7 +19,7 @@ from mi_nerfattack.experiment.sweep.table import RESULTS
 from mi_nerfattack.experiment.transfer.figures import DOCUMENT, QUALITY, read_document
 from mi_nerfattack.io import files
 from mi_nerfattack.report.pages.elements import (
-    Parts,
+    PageContents,
     RetrainPart,
     RunPart,
     TransferPart,
@@ -40,7 +40,7 @@ def read_folders(
     paths: Sequence[Path],
     scratch: Path,
     on_run: Callable[[str], None] = lambda label: None,
-) -> Parts:
+) -> PageContents:
     """Read finished runs, sweeps, transfers and retrainings.
 
     Args:
@@ -73,7 +73,7 @@ def read_folders(
             )
         else:
             raise InputError(f"{path}: holds no results; {_KINDS}")
-    return Parts(runs, sweeps, transfers, retrainings)
+    return PageContents(runs, sweeps, transfers, retrainings)
 
 
 def _transfer(folder: Path, label: str) -> TransferPart:
@@ -97,7 +97,7 @@ _LIMITS = {"linf": 1.0, "l2": 1.0}
 
 
 def write_page(
-    path: Path, parts: Parts, scratch: Path, title: str | None = None
+    path: Path, contents: PageContents, scratch: Path, title: str | None = None
 ) -> None:
     """Write one HTML file, atomically.
 
@@ -106,13 +106,15 @@ def write_page(
 
     Args:
         path: of the file.
-        parts: what it shows.
+        contents: what it shows.
         scratch: folder for plots that are made for the page.
         title: of the page; names of what it shows by default.
     """
-    damage = {**_damage(scratch, parts), **_by_limit(scratch, parts)}
-    write_results_page(path, title or _title(parts), replace(parts, damage=damage))
-    for sweep in parts.sweeps:
+    damage = {**_damage(scratch, contents), **_by_limit(scratch, contents)}
+    write_results_page(
+        path, title or _title(contents), replace(contents, damage=damage)
+    )
+    for sweep in contents.sweeps:
         damage |= {f"{sweep.label} {key}": own for key, own in sweep.pictures.items()}
     for key, picture in damage.items():
         for plot in (picture.with_suffix(".pdf"), picture.with_suffix(".svg")):
@@ -122,9 +124,9 @@ def write_page(
                 files.write_bytes(folder / name, files.read_bytes(plot, _MOST_BYTES))
 
 
-def _title(parts: Parts) -> str:
-    names = [run.document["scenario"]["name"] for run in parts.runs]
-    groups = parts.sweeps, parts.transfers, parts.retrainings
+def _title(contents: PageContents) -> str:
+    names = [run.document["scenario"]["name"] for run in contents.runs]
+    groups = contents.sweeps, contents.transfers, contents.retrainings
     for word, group in zip(("sweep", "transfer", "retraining"), groups, strict=True):
         labels = [part.label for part in group]
         names += [x if x.startswith(word) else f"{word} {x}" for x in labels]
@@ -132,17 +134,17 @@ def _title(parts: Parts) -> str:
     return ", ".join(names) if len(names) < 4 else f"{len(names)} results"
 
 
-def _settings(parts: Parts, deployed: bool) -> dict[str, list[RunPart]]:
+def _settings(contents: PageContents, deployed: bool) -> dict[str, list[RunPart]]:
     """Return the runs by what decides about their drives, in the page's order.
 
     Args:
-        parts: of the page.
+        contents: of the page.
         deployed: whether drives in deployments count.
     """
-    found: dict[str, list[RunPart]] = {}
-    for run in parts.runs:
-        found.setdefault(_setting(run, deployed), []).append(run)
-    return found
+    runs: dict[str, list[RunPart]] = {}
+    for run in contents.runs:
+        runs.setdefault(_setting(run, deployed), []).append(run)
+    return runs
 
 
 def _setting(run: RunPart, deployed: bool) -> str:
@@ -176,48 +178,50 @@ def _values(name: str, value: Any) -> Iterator[tuple[str, Any]]:
         yield name, value
 
 
-def _groups(parts: Parts, deployed: bool) -> dict[str, Parts]:
+def _groups(contents: PageContents, deployed: bool) -> dict[str, PageContents]:
     """Split runs and sweeps so that the attacks of a part may share a curve.
 
     Args:
-        parts: of the page.
+        contents: of the page.
         deployed: as of :func:`_settings`.
 
     Returns:
         by what follows the title of a plot: runs of one setting, or one sweep, which
         has one policy and vehicle; nothing follows where there is one part.
     """
-    found = {
-        f": {', '.join(run.label for run in own)}": Parts(runs=own)
-        for own in _settings(parts, deployed).values()
+    groups = {
+        f": {', '.join(run.label for run in own)}": PageContents(runs=own)
+        for own in _settings(contents, deployed).values()
     }
-    found |= {f": {sweep.label}": Parts(sweeps=[sweep]) for sweep in parts.sweeps}
-    return found if len(found) > 1 else dict.fromkeys([""], parts)
+    groups |= {
+        f": {sweep.label}": PageContents(sweeps=[sweep]) for sweep in contents.sweeps
+    }
+    return groups if len(groups) > 1 else dict.fromkeys([""], contents)
 
 
-def _damage(scratch: Path, parts: Parts) -> dict[str, Path]:
+def _damage(scratch: Path, contents: PageContents) -> dict[str, Path]:
     """Plot what attacks found against its cost, a plot for each group and route."""
-    found = {}
-    for name, part in _groups(parts, deployed=False).items():
+    pictures = {}
+    for name, part in _groups(contents, deployed=False).items():
         routes: dict[str, dict[str, plots.Curves]] = {}
         for route, method, curve in _curves(part):
             if curve is not None:
                 routes.setdefault(route, {}).setdefault(method, []).append(curve)
         for route, methods in routes.items():
             if sum(map(len, methods.values())) > 1:
-                path = scratch / f"damage_{len(found)}.png"
+                path = scratch / f"damage_{len(pictures)}.png"
                 plots.damage(path, methods)
-                found[f"Damage against frames, {route}{name}"] = path
-    return found
+                pictures[f"Damage against frames, {route}{name}"] = path
+    return pictures
 
 
-def _curves(parts: Parts) -> Iterator[tuple[str, str, Any]]:
+def _curves(contents: PageContents) -> Iterator[tuple[str, str, Any]]:
     """Yield route, method and curve of every attack; of a sweep, objects too."""
-    for run in parts.runs:
+    for run in contents.runs:
         for route in run.document["routes"]:
             method = run.document["scenario"]["attack"]["method"]["kind"]
             yield route, method, run.document.get("curve")
-    for sweep in parts.sweeps:
+    for sweep in contents.sweeps:
         attacks = sweep.document["attacks"]
         several = len({attack["objects"] for attack in attacks}) > 1
         for attack in attacks:
@@ -227,10 +231,10 @@ def _curves(parts: Parts) -> Iterator[tuple[str, str, Any]]:
             yield f"{attack['route']}{objects}", method, attack["curve"]
 
 
-def _by_limit(scratch: Path, parts: Parts) -> dict[str, Path]:
+def _by_limit(scratch: Path, contents: PageContents) -> dict[str, Path]:
     """Plot what attacks did against what their textures might change, by group."""
-    found = {}
-    for name, part in _groups(parts, deployed=True).items():
+    pictures = {}
+    for name, part in _groups(contents, deployed=True).items():
         for key, most in _LIMITS.items():
             points: dict[str, list[tuple[float, float]]] = {}
             for line, attack, error in _attacked(part):
@@ -238,26 +242,26 @@ def _by_limit(scratch: Path, parts: Parts) -> dict[str, Path]:
                 at = most if limit is None else limit
                 points.setdefault(line, []).append((at, error))
             if len({at for own in points.values() for at, _ in own}) > 1:
-                path = scratch / f"limit_{len(found)}_{key}.png"
+                path = scratch / f"limit_{len(pictures)}_{key}.png"
                 label = f"attack.freedom.{key}, sRGB (without one: {most:g})"
                 plots.against_limit(path, label, points)
-                found[f"Damage against the texture's budget, {key}{name}"] = path
-    return found
+                pictures[f"Damage against the texture's budget, {key}{name}"] = path
+    return pictures
 
 
-def _attacked(parts: Parts) -> Iterator[tuple[str, Mapping[str, Any], float]]:
+def _attacked(contents: PageContents) -> Iterator[tuple[str, Mapping[str, Any], float]]:
     """Yield line, section `attack` and mean error of every attack in an environment.
 
     A line is of one route, environment and method; of a sweep, of one kind of objects.
     """
-    for run in parts.runs:
+    for run in contents.runs:
         section = run.document["scenario"]["attack"]
         for row in cells(run.document["routes"], "route", "environment"):
             if ATTACK in row:
                 line = f"{row['route']}, {row['environment']}"
                 error = row[ATTACK]["cross_track_mean_m"]
                 yield f"{line}, {section['method']['kind']}", section, error
-    for sweep in parts.sweeps:
+    for sweep in contents.sweeps:
         for row in sweep.attacks:
             if ATTACK in row["cases"] and row["section"] is not None:
                 words = (row[k] for k in ("route", "objects", "environment", "method"))

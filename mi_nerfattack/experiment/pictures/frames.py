@@ -54,9 +54,9 @@ class FrameFolder:
 
     def __init__(self, path: Path, rig: Rig) -> None:
         self.path, self.rig = files.make_folder(path), rig
-        for found in list(self.path.iterdir()):
-            if _OURS.fullmatch(found.name):
-                found.unlink()
+        for file in list(self.path.iterdir()):
+            if _OURS.fullmatch(file.name):
+                file.unlink()
         self._names: list[str] = []
         self._times: list[float] = []
         self._poses: list[np.ndarray] = []
@@ -122,9 +122,9 @@ def nominal_drives(drives: Sequence[Drive], cases: Collection[str]) -> list[Driv
         drives: of a run.
         cases: of which drives are wanted.
     """
-    found = [d for d in drives if d.run == 0 and d.case in cases]
+    nominal = [d for d in drives if d.run == 0 and d.case in cases]
     return sorted(
-        found, key=lambda d: (environment_order(d.environment), CASES.index(d.case))
+        nominal, key=lambda d: (environment_order(d.environment), CASES.index(d.case))
     )
 
 
@@ -180,13 +180,13 @@ def write_frames(
         row, written = rows.setdefault(label, []), frame_steps(drive, frames)
         environment = world.open(drive.environment, empty=look is None)
         try:
-            seen = {**digests, **_digests(world, look)}
-            film = Film(world, drive, environment, look is None, seen)
+            drive_digests = {**digests, **_digests(world, look)}
+            film = Film(world, drive, environment, look is None, drive_digests)
             folder = FrameFolder(frame_folder(output, drive), environment.rig)
             costs = film.cost_by_image(written)
             for moment in film.moments({*columns, *written}):
                 shown = columns.count(moment.step)
-                row += [moment.seen.image] * shown if shown else []
+                row += [moment.rendered_frame.image] * shown if shown else []
                 if moment.step in written:
                     film.write(folder, moment, costs.get(moment.step))
                 done_so_far = count + moment.step + 1
@@ -216,7 +216,7 @@ class Moment:
     frame: CameraFrame | None
 
     @property
-    def seen(self) -> CameraFrame:
+    def rendered_frame(self) -> CameraFrame:
         """The frame, which was asked for."""
         assert self.frame is not None
         return self.frame
@@ -240,11 +240,11 @@ class Film:
     empty: bool
     digests: Mapping[str, str]
 
-    def moments(self, wanted: Collection[int]) -> Iterator[Moment]:
+    def moments(self, steps: Collection[int]) -> Iterator[Moment]:
         """Drive by the recorded controls; a policy with a memory sees all frames.
 
         Args:
-            wanted: control periods before the frames that are to be seen.
+            steps: control periods before the frames that are to be seen.
         """
         policy, route, drive = self.world.policy, self.world.route, self.drive
         memory = policy.initial_memory(1)
@@ -253,11 +253,11 @@ class Film:
         for step in range(len(drive.controls) + 1):
             if step:
                 control = drive.controls[step - 1]
-                if watched or step in wanted:
+                if watched or step in steps:
                     frame = self.environment.step(control)
                 else:
                     self.environment.advance(control)
-            shown = frame if step in wanted else None
+            shown = frame if step in steps else None
             yield Moment(step, self.environment.state, memory, shown)
             if watched:
                 numbers = policy_numbers(policy, self.environment, route, step)
@@ -278,11 +278,11 @@ class Film:
         is_surrogate = isinstance(environment, SurrogateEnvironment)
         if not is_surrogate or not world.policy.differentiable:
             return {}
-        found = list(self.moments(()))
+        moments = list(self.moments(()))
         rows = [to_control(np.reshape(u, (1, -1))) for u in self.drive.controls]
-        states = [to_state(moment.state[None]) for moment in found]
-        loop, kept = world.loop(environment.sensor), [m.memory for m in found]
-        drive = Trajectory(tuple(states), tuple(rows), loop.dt, tuple(kept))
+        states = [to_state(moment.state[None]) for moment in moments]
+        loop, memories = world.loop(environment.sensor), [m.memory for m in moments]
+        drive = Trajectory(tuple(states), tuple(rows), loop.dt, tuple(memories))
         attached = world.scenario.attack.attached
         rollout = Rollout(loop, world.objective, drive.horizon, attached=attached)
         by_images = rollout.by_images(drive, {k for k in steps if k < drive.horizon})
@@ -298,7 +298,8 @@ class Film:
             moment: when.
             cost: derivative of the objective by the image, (height, width, 3).
         """
-        frame, names = moment.seen, [item.id for item in self.world.scenario.objects]
+        frame = moment.rendered_frame
+        names = [item.id for item in self.world.scenario.objects]
         names = [] if self.empty else names
         layers = frame.layers(["object"] if len(names) == 1 else names)
         if cost is not None:
@@ -319,7 +320,7 @@ class Film:
         label, state, rig = drive.environment, moment.state, self.environment.rig
         return frame_metadata(
             describe_lens(rig.cameras[0]),
-            moment.seen.camera_to_world,
+            moment.rendered_frame.camera_to_world,
             drive.seed,
             world.surrogate.camera.spp
             if label == SURROGATE
@@ -344,9 +345,9 @@ def _digests(world: World, look: Appearance | None) -> dict[str, str]:
     """Hash textures as files of fields hold them."""
     if look is None:
         return {}
-    found = {}
+    digests = {}
     objects = zip(world.scenario.objects, world.fields, look.textures, strict=True)
     for item, field, texture in objects:
         raw = texture[field.held_vertices()].astype(np.float16).tobytes()
-        found[f"texture.{item.id}"] = hashlib.sha256(raw).hexdigest()
-    return found
+        digests[f"texture.{item.id}"] = hashlib.sha256(raw).hexdigest()
+    return digests

@@ -64,8 +64,8 @@ def write_images(
         names = [item.id for item in world.scenario.objects]
         sweeps = 3 * world.horizon
         on_step = step_counter(on_progress, "surrogate: attribution", sweeps)
-        found = attribute(done.attack, names, limit, on_step)
-        write_attribution(output, found, world.fields)
+        attribution = attribute(done.attack, names, limit, on_step)
+        write_attribution(output, attribution, world.fields)
     write_frames(output, done, frames, on_progress)
     if frames == "all":
         _write_videos(output, done, on_progress)
@@ -98,8 +98,8 @@ def _write_triptych(output: Path, done: Finished) -> None:
     ]
     points = [d.states[:, :2] for group in groups for d in group]
     footprints = object_footprints(world.surrogate.objects)
-    seen = np.concatenate([*points, *footprints])
-    above = Overhead.covering(seen, route.lane_width_m, _GROUND_PX)
+    ground_points = np.concatenate([*points, *footprints])
+    above = Overhead.covering(ground_points, route.lane_width_m, _GROUND_PX)
     scene = mesh_scene(world)
     bare = None if scene is None else scene_above(scene, above, points[0], 4)
     panels = []

@@ -65,7 +65,9 @@ class AmongFound(AbstractStaging):
 
     def identity(self) -> dict[str, str]:
         """Return digests of what was found, and of its scenarios."""
-        runs = [(found.digest, short_digest(found.identity)) for found in self.attacks]
+        runs = [
+            (attack.digest, short_digest(attack.identity)) for attack in self.attacks
+        ]
         return flatten("staging.found", sorted(runs))
 
     def open(
@@ -91,8 +93,8 @@ class _FoundStage(AbstractStage):
     def draw_stretch(self, rng: np.random.Generator) -> tuple[Route, Stretch]:
         """Return the run's route, and the part from which it passes its objects."""
         del rng
-        found = self._attacks[self._number]
-        return found.route, passed_stretch(found, self._objects)
+        attack = self._attacks[self._number]
+        return attack.route, passed_stretch(attack, self._objects)
 
     def objects(
         self, route: Route, arc: float, rng: np.random.Generator
@@ -102,28 +104,28 @@ class _FoundStage(AbstractStage):
         return self._objects
 
 
-def attacked_objects(found: FoundAttack) -> list[PosedField]:
+def attacked_objects(attack: FoundAttack) -> list[PosedField]:
     """Load the objects of a run as it left them, where it left them.
 
     Raises:
         InputError: a file is missing or damaged.
     """
     result = []
-    for item, offset in zip(found.scenario.objects, found.offsets, strict=True):
-        field = item.load(object_path(found.folder, item.id))
+    for item, offset in zip(attack.scenario.objects, attack.offsets, strict=True):
+        field = item.load(object_path(attack.folder, item.id))
         result.append(PosedField(field, item.pose))
         result[-1].move(offset)
     return result
 
 
-def passed_stretch(found: FoundAttack, objects: Sequence[PosedField]) -> Stretch:
+def passed_stretch(attack: FoundAttack, objects: Sequence[PosedField]) -> Stretch:
     """Return the arc lengths from a drive's start to its farthest object or its end.
 
     Args:
-        found: whose drive it is.
+        attack: whose drive it is.
         objects: its own.
     """
-    route, scenario = found.route, found.scenario
+    route, scenario = attack.route, attack.scenario
     start, end = scenario.drive.stretch(route, scenario.vehicle.dt_s)
     poses = [[*posed.placed.translation[:2], 0.0] for posed in objects]
     ahead = route.project_numpy(np.array(poses))[0] - start
@@ -141,16 +143,16 @@ def found_place(attacks: Sequence[FoundAttack]) -> Place:
             Mitsuba scene of the surrogate.
     """
     first = attacks[0]
-    for found in attacks:
-        if found.scenario.scene.surrogate is not None:
+    for attack in attacks:
+        if attack.scenario.scene.surrogate is not None:
             raise InputError(
-                f"{found.folder}: its objects stand in {found.scenario.scene.surrogate}"
-                ", a Mitsuba scene; frames are taken among objects of a scenario with "
-                "scene.field: leave this run out"
+                f"{attack.folder}: its objects stand in "
+                f"{attack.scenario.scene.surrogate}, a Mitsuba scene; frames are taken "
+                "among objects of a scenario with scene.field: leave this run out"
             )
-        here, there = (_shared(run) for run in (found, first))
+        shared, reference = (_shared(run) for run in (attack, first))
         remedy = f"it is compared with {first.folder}; retrain in one place at a time"
-        refuse(found.folder, differences(here, there), remedy)
+        refuse(attack.folder, differences(shared, reference), remedy)
     scenario = first.scenario
     scene = scenario.scene
     assert scene.field is not None  # checked by SceneSection
@@ -159,8 +161,8 @@ def found_place(attacks: Sequence[FoundAttack]) -> Place:
     return replace(place, field=scene.field.file) if plain else place
 
 
-def _shared(found: FoundAttack) -> dict[str, str]:
-    identity = found.identity.items()
+def _shared(attack: FoundAttack) -> dict[str, str]:
+    identity = attack.identity.items()
     return {key: value for key, value in identity if is_within(key, _SHARED)}
 
 
@@ -172,11 +174,11 @@ def attacked_policy(attacks: Sequence[FoundAttack]) -> AbstractPolicySection:
     """
     first = attacks[0]
     policy = first.scenario.policy
-    for found in attacks:
-        other = found.scenario.policy
+    for attack in attacks:
+        other = attack.scenario.policy
         if section_content(other) != section_content(policy):
             raise InputError(
-                f"{found.folder}: attacked {other.source}, {first.folder} "
+                f"{attack.folder}: attacked {other.source}, {first.folder} "
                 f"{policy.source}, of other content; retrain one policy at a time"
             )
     return policy
@@ -188,10 +190,10 @@ def attacked_weights(attacks: Sequence[FoundAttack]) -> Path:
     Raises:
         InputError: they attacked different policies, or one that is not PilotNet alone.
     """
-    for found in attacks:
-        if not _is_plain(policy := found.scenario.policy):
+    for attack in attacks:
+        if not _is_plain(policy := attack.scenario.policy):
             raise InputError(
-                f"{found.folder}: attacked {policy.source}; only PilotNet of "
+                f"{attack.folder}: attacked {policy.source}; only PilotNet of "
                 "'mi-nerfattack train', without further keys of [policy], can be "
                 "retrained without your help; give your own training with --command "
                 "or --module"
@@ -252,8 +254,8 @@ class SectionDrives(AbstractSource):
         def control(image: np.ndarray) -> Controls:
             nonlocal memory, step
             numbers = policy_numbers(prepared, environment, route, step)
-            seen, step = policy_image(image), step + 1
-            row, memory = prepared.step(seen, route.goal, memory, numbers)
+            observation, step = policy_image(image), step + 1
+            row, memory = prepared.step(observation, route.goal, memory, numbers)
             return single_control(row, environment.control_names)
 
         yield from scenery.drive(control, self.horizon)
@@ -290,7 +292,7 @@ class FramesAmong:
         )
 
     def imitate(
-        self, start: PilotNet, more: Sequence[Path], progress: OnStage
+        self, start: PilotNet, earlier_shards: Sequence[Path], progress: OnStage
     ) -> Imitated:
         """Collect them, and train PilotNet further on them and on other shards."""
         return imitate(
@@ -301,11 +303,13 @@ class FramesAmong:
             self.workers,
             progress,
             start,
-            more,
+            earlier_shards,
             AmongFound(tuple(self.attacks)),
         )
 
     @property
     def routes(self) -> list[Route]:
         """Routes of the attacks, each once."""
-        return list({found.route.name: found.route for found in self.attacks}.values())
+        return list(
+            {attack.route.name: attack.route for attack in self.attacks}.values()
+        )

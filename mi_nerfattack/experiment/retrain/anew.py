@@ -40,7 +40,7 @@ def attack_anew(
     Raises:
         InputError: another process works in the folder, or an attack fails.
     """
-    cells = tuple(_cell(found, policy) for found in attacks)
+    cells = tuple(_cell(attack, policy) for attack in attacks)
     count = tally(progress, 0, len(cells))
 
     def on_end(index: int, error: Exception | None) -> None:
@@ -54,16 +54,16 @@ def attack_anew(
     return list(read_found([folder_of(folder, cell) for cell in cells]))
 
 
-def _cell(found: FoundAttack, policy: str) -> Cell:
+def _cell(attack: FoundAttack, policy: str) -> Cell:
     """Return a run's scenario with another policy as a cell of a sweep.
 
     What the checks before an attack find is told by its flags, and refuses nothing: the
     run counted, too.
     """
-    scenario, text = read_with_policy(found, policy)
+    scenario, text = read_with_policy(attack, policy)
     ids = "+".join(item.id for item in scenario.objects)
     return Cell(
-        axis_name(found.route.name),
+        axis_name(attack.route.name),
         axis_name(ids),
         scenario.attack.method.kind,
         None,

@@ -53,13 +53,19 @@ class Comparison:
             policy: that drives, see :func:`with_policy`; the attacked one by default.
         """
         attacks = [
-            with_policy(found, policy) if policy else found
-            for found in self.groups[group]
+            with_policy(attack, policy) if policy else attack
+            for attack in self.groups[group]
         ]
         columns = make_columns(self.environments, ("day",), self.spp)
         store = Store(self._output(group, stage) / DRIVES)
-        about = tuple(attacks), columns, _CASES, self.starts, _SEED
-        return TransferDrives(store, *about)
+        return TransferDrives(
+            store,
+            tuple(attacks),
+            columns,
+            cases=_CASES,
+            starts=self.starts,
+            seed=_SEED,
+        )
 
     def drive(
         self,
@@ -69,37 +75,37 @@ class Comparison:
         policy: str = "",
     ) -> dict[str, dict[str, Any]]:
         """Do the drives that are not there yet; return `transfer.json` by group."""
-        found = {}
+        documents = {}
         for group in self.groups:
             output = self._output(group, stage)
             check_output(output)
             work = self.work(group, stage, policy)
             show = progress(f"{stage}, {group}")
-            found[group] = run_transfer(work, output, workers, show)
-        return found
+            documents[group] = run_transfer(work, output, workers, show)
+        return documents
 
     def _output(self, group: str, stage: str) -> Path:
         return self.folder / f"{group}_{stage}"
 
 
-def with_policy(found: FoundAttack, policy: str) -> FoundAttack:
+def with_policy(attack: FoundAttack, policy: str) -> FoundAttack:
     """Let another policy drive past what was found.
 
     Args:
-        found: the attack.
+        attack: that was found.
         policy: key and value that replace those of its scenario, as of ``--set``; see
             `new_policy.setting`.
 
     Raises:
         InputError: the scenario with this policy is not usable.
     """
-    scenario, _ = read_with_policy(found, policy)
-    return replace(found, scenario=scenario, identity=scenario.identity())
+    scenario, _ = read_with_policy(attack, policy)
+    return replace(attack, scenario=scenario, identity=scenario.identity())
 
 
-def read_with_policy(found: FoundAttack, policy: str) -> tuple[Scenario, str]:
+def read_with_policy(attack: FoundAttack, policy: str) -> tuple[Scenario, str]:
     """Read the scenario of :func:`with_policy`; return its text, too."""
-    return load_scenario(found.folder / SCENARIO, settings=(policy,))
+    return load_scenario(attack.folder / SCENARIO, settings=(policy,))
 
 
 def table_rows(

@@ -58,7 +58,7 @@ class Successor:
         return None if self._named is None else self._named[1].file
 
     @property
-    def about(self) -> dict[str, str]:
+    def content(self) -> dict[str, str]:
         """Name and checksum of this file; the URL of a server."""
         if self._named is None:
             return {"url": self.attacked.source}
@@ -96,22 +96,22 @@ def read_keys(path: Path) -> dict[str, Any]:
     Raises:
         InputError: it cannot be read, has other sections, or names what is missing.
     """
-    found = files.read_toml(path)
-    if list(found) != ["policy"]:
-        there = ", ".join(found) or "nothing"
+    document = files.read_toml(path)
+    if list(document) != ["policy"]:
+        there = ", ".join(document) or "nothing"
         raise InputError(f"{path}: has {there}; a section [policy] alone is needed")
-    keys = found["policy"]
+    keys = document["policy"]
     section = read_section(f"{path}: policy", PolicySection, keys, path.parent)
     named = {name: getattr(section, name) for name in type(section).model_fields}
     named = {k: v.portable for k, v in named.items() if isinstance(v, NamedFile)}
     return {**keys, **named}
 
 
-def try_policy(found: FoundAttack, setting: str, attacked_again: bool) -> str:
+def try_policy(attack: FoundAttack, setting: str, attacked_again: bool) -> str:
     """Make a new policy and show it one grey image; return a digest of its content.
 
     Args:
-        found: whose scenario it is for.
+        attack: whose scenario it is for.
         setting: of `Successor.setting`.
         attacked_again: whether the scenario's attack must be able to use it.
 
@@ -119,7 +119,7 @@ def try_policy(found: FoundAttack, setting: str, attacked_again: bool) -> str:
         InputError: it cannot be made, does not take the camera's images, or its control
             is not finite.
     """
-    scenario, _ = read_with_policy(found, setting)
+    scenario, _ = read_with_policy(attack, setting)
     rig = scenario.rig()
     if attacked_again:
         policy = scenario.build_policy()
@@ -128,7 +128,7 @@ def try_policy(found: FoundAttack, setting: str, attacked_again: bool) -> str:
     width, height = rig.size
     image = policy_image(np.full((height, width, 3), 128, np.uint8))
     numbers = trial_numbers(policy)
-    row, _ = policy.step(image, found.route.goal, policy.initial_memory(1), numbers)
+    row, _ = policy.step(image, attack.route.goal, policy.initial_memory(1), numbers)
     if not np.isfinite(np.array(row)).all():
         raise InputError(f"{scenario.policy.source}: gives the control {np.array(row)}")
     return json_digest(section_content(scenario.policy))
@@ -145,8 +145,8 @@ def install(path: Path, output: Path) -> None:
 def _inline(value: Any) -> str:
     """Write a value of TOML in one line."""
     if isinstance(value, Mapping):
-        parts = [f"{_inline(key)} = {_inline(item)}" for key, item in value.items()]
-        return "{" + ", ".join(parts) + "}"
+        pairs = [f"{_inline(key)} = {_inline(item)}" for key, item in value.items()]
+        return "{" + ", ".join(pairs) + "}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_inline, value)) + "]"
     return tomlkit.item(value).as_string()

@@ -49,17 +49,17 @@ class Driven:
         return ""
 
 
-def drive_expert(found: FoundAttack) -> Driven:
+def drive_expert(attack: FoundAttack) -> Driven:
     """Let the expert drive a run's scenario; nothing is rendered.
 
     Raises:
         InputError: see :func:`among.found_place`, or no expert knows the vehicle.
     """
-    place = found_place([found])
-    scenario, route, car = found.scenario, found.route, place.car
+    place = found_place([attack])
+    scenario, route, car = attack.scenario, attack.route, place.car
     if not scenario.vehicle.has_expert:
         raise InputError(
-            f"{found.folder}: vehicle.control_unit: is neither rad/s nor rad, and no "
+            f"{attack.folder}: vehicle.control_unit: is neither rad/s nor rad, and no "
             "expert drives such a vehicle; give it, and attack once more"
         )
     vehicle = kinematic_vehicle(place)
@@ -71,19 +71,19 @@ def drive_expert(found: FoundAttack) -> Driven:
         car.wheelbase,
         acceleration=acceleration_of(car.more_controls),
     )
-    objects = [item for item in attacked_objects(found) if _is_in_the_way(item)]
+    objects = [item for item in attacked_objects(attack) if _is_in_the_way(item)]
     outlines = np.concatenate([np.zeros((0, 2)), *map(_outline, objects)])
     errors, gaps = [], []
     for pose in initial_states(scenario, route, scenario.drive.runs, 0):
         vehicle.reset(pose, route.speed_ms)
         states = [vehicle.state[:3]]
-        for _ in range(found.horizon):
+        for _ in range(attack.horizon):
             vehicle.advance(expert.control(vehicle.state)[0])
             states.append(vehicle.state[:3])
         path = np.stack(states)
         errors.append(np.abs(route.cross_track_numpy(path[1:])).max())
         gaps.append(_distance(path[:, :2], outlines) - car.width / 2)
-    return Driven(float(max(errors)), found.lane.wheel_m, float(min(gaps)))
+    return Driven(float(max(errors)), attack.lane.wheel_m, float(min(gaps)))
 
 
 def _is_in_the_way(posed: PosedField) -> bool:
@@ -128,9 +128,9 @@ def divide_solvable(
         the former; and by label why each of the latter cannot count.
     """
     solvable, others = [], {}
-    for found in attacks:
-        if trouble := drive_expert(found).trouble:
-            others[found.label] = trouble
+    for attack in attacks:
+        if trouble := drive_expert(attack).trouble:
+            others[attack.label] = trouble
         else:
-            solvable.append(found)
+            solvable.append(attack)
     return solvable, others

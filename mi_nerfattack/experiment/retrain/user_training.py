@@ -136,7 +136,7 @@ class CommandTraining(AbstractUserTraining):
 
     def _filled(self, order: TrainingOrder) -> list[str]:
         return [
-            _BRACES.sub(lambda found: str(getattr(order, found[1])), word)
+            _BRACES.sub(lambda match: str(getattr(order, match[1])), word)
             for word in self._words
         ]
 
@@ -182,7 +182,7 @@ class ModuleTraining(AbstractUserTraining):
         return self.name
 
     @property
-    def _parts(self) -> tuple[Path, str]:
+    def _file_and_function(self) -> tuple[Path, str]:
         file, _, function = self.name.rpartition(":")
         if not file.endswith(".py") or not function.isidentifier():
             raise InputError(
@@ -192,7 +192,7 @@ class ModuleTraining(AbstractUserTraining):
 
     def check(self, order: TrainingOrder) -> None:
         """Run the file, if that is allowed, and find the function."""
-        file, function = self._parts
+        file, function = self._file_and_function
         if not self.trusted:
             raise InputError(
                 f"{self.option}: {self.name}: is code and runs with all rights of your "
@@ -202,14 +202,15 @@ class ModuleTraining(AbstractUserTraining):
 
     def code(self) -> dict[str, str]:
         """Return checksums of the file, and of those in its folder that it imports."""
-        file, _ = self._parts
+        file, _ = self._file_and_function
         return _checksums({file.name: file} | helper_files(file))
 
     def run(self, order: TrainingOrder, lock: int | None) -> None:
         """Call the function; what it makes of an interrupt does not count."""
         try:
             with noticed_interrupts():
-                load_function(*self._parts)(order.data, order.out, order.seed)
+                file, function = self._file_and_function
+                load_function(file, function)(order.data, order.out, order.seed)
         except SystemExit as err:
             raise InputError(
                 f"{self.option}: {self.name}: ends the program ({err.code}); let it "
@@ -243,12 +244,12 @@ def chosen_training(
 
 def _checksums(named: Mapping[str, Path]) -> dict[str, str]:
     """Return checksums by name; absolute paths tell about the machine alone."""
-    found: dict[str, str] = {}
+    checksums: dict[str, str] = {}
     for name, path in named.items():
         short = Path(name).name if os.path.isabs(name) else name
-        key = short if short not in found else f"{short} {len(found)}"
-        found[key] = files.sha256(path)
-    return found
+        key = short if short not in checksums else f"{short} {len(checksums)}"
+        checksums[key] = files.sha256(path)
+    return checksums
 
 
 def train_once(
@@ -276,15 +277,15 @@ def train_once(
             nothing that can be used.
     """
     folder = files.make_folder(order.out.parent)
-    about = {
+    identity = {
         training.option.lstrip("-"): training.text,
         "seed": order.seed,
         "code": training.code(),
         "frames_sha256": json_digest([files.sha256(path) for path in shards]),
     }
     with exclusive(folder) as lock:
-        if _is_done(folder, order.out.name, about, check):
-            return about
+        if _is_done(folder, order.out.name, identity, check):
+            return identity
         for path in (folder / DONE, order.out):
             with files.reported(path):
                 path.unlink(missing_ok=True)
@@ -300,9 +301,9 @@ def train_once(
             raise InputError(
                 f"{training.option}: {training.text}: wrote what cannot be used: {err}"
             ) from err
-        kept = {"about": about, "file": order.out.name, "policy": digest}
-        files.write_json(folder / DONE, kept)
-    return about
+        record = {"about": identity, "file": order.out.name, "policy": digest}
+        files.write_json(folder / DONE, record)
+    return identity
 
 
 #: What was trained, beside the policy that came of it.
@@ -310,11 +311,11 @@ DONE = "done.json"
 
 
 def _is_done(
-    folder: Path, name: str, about: Mapping[str, Any], check: Callable[[], str]
+    folder: Path, name: str, identity: Mapping[str, Any], check: Callable[[], str]
 ) -> bool:
     """Whether a training was done, and the file that came of it is still there."""
     try:
-        kept = files.read_json(folder / DONE)
-        return kept == {"about": about, "file": name, "policy": check()}
+        record = files.read_json(folder / DONE)
+        return record == {"about": identity, "file": name, "policy": check()}
     except InputError:  # nothing was done yet, or it is no longer usable
         return False

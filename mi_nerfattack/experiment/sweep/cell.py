@@ -120,8 +120,10 @@ def changed(cell: Cell) -> list[str]:
     Raises:
         InputError: a file is missing.
     """
-    found, told = cell.scenario.digests(), cell.digests
-    return sorted(k for k in found.keys() | told.keys() if found.get(k) != told.get(k))
+    current, recorded = cell.scenario.digests(), cell.digests
+    return sorted(
+        k for k in current.keys() | recorded.keys() if current.get(k) != recorded.get(k)
+    )
 
 
 def run_cell(cell: Cell, sweep: Path, on_step: Callable[[], None]) -> None:
@@ -150,11 +152,11 @@ def run_cell(cell: Cell, sweep: Path, on_step: Callable[[], None]) -> None:
                 "sweep began; give the same command again, and all machines one disk"
             )
         policy, frames = scenario.build_policy(), 3 if cell.pictures else None
-        job = Job(scenario, cell.text, policy, output, lambda *told: on_step())
+        job = Job(scenario, cell.text, policy, output, lambda *progress: on_step())
         job.frames, job.shared = frames, sweep / SHARED
         with one_thread():
             job.run_claimed(anyway=cell.anyway)
-        about = asdict(cell) | {"versions": versions()}
-        del about["text"]  # the run folder's scenario.toml
-        files.write_json(output / PROVENANCE, about)
+        provenance = asdict(cell) | {"versions": versions()}
+        del provenance["text"]  # the run folder's scenario.toml
+        files.write_json(output / PROVENANCE, provenance)
         files.write_bytes(output / COMPLETE, b"")

@@ -39,7 +39,7 @@ class Forecast:
 
     cells: Sequence[Cell]
     folder: Path | None
-    on_progress: Callable[[str, int, int, str], None] = lambda *told: None
+    on_progress: Callable[[str, int, int, str], None] = lambda *progress: None
     refused: dict[Place, list[str]] = field(default_factory=dict)
     doubts: dict[Place, list[str]] = field(default_factory=dict)
     costs: dict[tuple[Any, ...], Cost | None] = field(default_factory=dict)
@@ -78,8 +78,8 @@ class Forecast:
             return
         if drives:
             check.price()
-        kept = self.doubts if cell.anyway else self.refused
-        kept[place] += check.refused
+        findings = self.doubts if cell.anyway else self.refused
+        findings[place] += check.refused
         self.doubts[place] += check.doubts
         self.costs[cell.kind] = check.cost
 
@@ -99,22 +99,22 @@ class Forecast:
         left = [cell for cell in self.cells if not self._is_complete(cell)]
         costs = [self.costs[cell.kind] for cell in left]
         known = [cost for cost in costs if cost is not None]
-        whole = len(known) == len(left)
-        told = {
+        all_timed = len(known) == len(left)
+        costs_by_kind = {
             _words(kind): None if cost is None else cost.document()
             for kind, cost in self.costs.items()
         }
         return {
             "cells": len(self.cells),
             "complete": len(self.cells) - len(left),
-            "frames": sum(cost.frames for cost in known) if whole else None,
-            "wall_s": sum(cost.wall_s for cost in known) if whole else None,
-            "disk_mb": sum(cost.disk_mb for cost in known) if whole else None,
+            "frames": sum(cost.frames for cost in known) if all_timed else None,
+            "wall_s": sum(cost.wall_s for cost in known) if all_timed else None,
+            "disk_mb": sum(cost.disk_mb for cost in known) if all_timed else None,
             "disk_free_mb": _free_mb(self.folder or Path()),
             "memory_mb": max((c.memory_mb for c in known), default=None),
             "refused": {" ".join(p): lines for p, lines in self.refused.items()},
             "doubts": {" ".join(p): lines for p, lines in self.doubts.items()},
-            "costs": told,
+            "costs": costs_by_kind,
         }
 
 
@@ -126,14 +126,14 @@ def sentences(document: dict[str, Any], workers: int) -> list[str]:
         workers: cells that are done at a time.
     """
     cells, complete = document["cells"], document["complete"]
-    head, rest = f"{cells} cells", ": "
+    head, separator = f"{cells} cells", ": "
     if complete:
-        head, rest = f"{head}, {complete} complete", "; the rest: "
+        head, separator = f"{head}, {complete} complete", "; the rest: "
     if document["wall_s"] is None:
         head += "; not all of them could be timed"
     elif complete < cells:
         head += (
-            f"{rest}{document['frames']} frames, "
+            f"{separator}{document['frames']} frames, "
             f"{duration(document['wall_s'] / workers)} for {workers} at a time, as "
             f"busy as this machine is, {document['disk_mb']:.0f} MB of disk "
             f"({document['disk_free_mb']:.0f} MB are free), at most "
@@ -147,8 +147,8 @@ def sentences(document: dict[str, Any], workers: int) -> list[str]:
             lines.append(f"{name}: a backward pass costs {multiple:.1f} drives")
     for word in ("refused", "doubts"):
         shown = "refused" if word == "refused" else "look at"
-        for place, told in document[word].items():
-            lines += [f"{shown}: {place}: {line}" for line in told]
+        for place, findings in document[word].items():
+            lines += [f"{shown}: {place}: {line}" for line in findings]
     return lines
 
 

@@ -100,8 +100,8 @@ class Grid(Section):
             for name in choice.routes or ():
                 if name not in known:
                     refuse(f"objects.{index}.routes", f"{name!r}; one of {known}")
-            here = [own for own, _ in choice.places]
-            for place in itertools.product(choice.routes or known or [""], here):
+            place_names = [own for own, _ in choice.places]
+            for place in itertools.product(choice.routes or known or [""], place_names):
                 if place in taken:
                     refuse(
                         f"objects.{index}.name",
@@ -163,12 +163,21 @@ class GridReader:
                     drawn = self._drawn(i, j, seed if place is None else place)
                     layers["objects", j, "set"] = these.set | {"objects": drawn}
                 layers["methods", k, "set"] = method.set
-                labels = self._routes[i].name, name, method.name, budget, seed
                 multiple = method.backward_multiple
                 if multiple is None:
                     multiple = grid.backward_multiple
-                made = self._scenario(layers, seed, budget, multiple)
-                yield Cell(*labels, *made, grid.anyway, grid.pictures)
+                text, digests = self._scenario(layers, seed, budget, multiple)
+                yield Cell(
+                    self._routes[i].name,
+                    name,
+                    method.name,
+                    budget=budget,
+                    seed=seed,
+                    text=text,
+                    digests=digests,
+                    anyway=grid.anyway,
+                    pictures=grid.pictures,
+                )
 
     def labels(self) -> Iterator[tuple[Any, ...]]:
         """Yield route, objects, method, budget and seed of each cell; draw no place."""
@@ -239,8 +248,8 @@ class GridReader:
             values = _merged(values, layer)
         match values:
             case {"attack": {"method": {**method}} as attack} if budget is not None:
-                kept = {k: v for k, v in method.items() if k not in _LENGTHS}
-                values = values | {"attack": attack | {"method": kept}}
+                without_length = {k: v for k, v in method.items() if k not in _LENGTHS}
+                values = values | {"attack": attack | {"method": without_length}}
         scenario = self._read(values, layers)
         if budget is not None:
             length = self._length(scenario, budget, multiple)
@@ -254,26 +263,30 @@ class GridReader:
         try:
             return Scenario.model_validate(values, context=context)
         except ValidationError as err:
-            told = new_lines(self.path, self.text)
-            raise InputError(told or self._told(list(problems(err)), layers)) from err
+            message = new_lines(self.path, self.text)
+            raise InputError(
+                message or self._message(list(problems(err)), layers)
+            ) from err
 
-    def _told(
-        self, found: list[tuple[Location, str]], layers: Mapping[Location, Any]
+    def _message(
+        self, issues: list[tuple[Location, str]], layers: Mapping[Location, Any]
     ) -> str:
         """Tell problems of a cell where the keys were given."""
-        here: list[tuple[Location, str]] = []
-        there: list[tuple[Location, str]] = []
-        for keys, problem in found:
+        grid_issues: list[tuple[Location, str]] = []
+        base_issues: list[tuple[Location, str]] = []
+        for keys, problem in issues:
             depth, where = max(
                 (_depth(layer, keys), where) for where, layer in layers.items()
             )
             if depth and depth >= _depth(self.values, keys):
-                here.append(((*where, *keys), problem))
+                grid_issues.append(((*where, *keys), problem))
             else:
-                there.append((keys, problem))
-        told = tell(self.path, self.text, here) if here else ""
-        rest = tell(self.base_path, self.base_text, there) if there else ""
-        return "\n".join(filter(None, (told, rest)))
+                base_issues.append((keys, problem))
+        grid_message = tell(self.path, self.text, grid_issues) if grid_issues else ""
+        base_message = (
+            tell(self.base_path, self.base_text, base_issues) if base_issues else ""
+        )
+        return "\n".join(filter(None, (grid_message, base_message)))
 
     def _length(
         self, scenario: Scenario, budget: int, multiple: float | None
@@ -326,13 +339,13 @@ def axis_name(text: str) -> str:
 
 def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
     """Merge tables key by key; other values replace what is below."""
-    found = dict(below)
+    merged = dict(below)
     for key, value in above.items():
-        old = found.get(key)
+        old = merged.get(key)
         if isinstance(old, dict) and isinstance(value, dict):
             value = _merged(old, value)
-        found[key] = value
-    return found
+        merged[key] = value
+    return merged
 
 
 def _depth(values: Any, keys: Sequence[str | int]) -> int:

@@ -74,18 +74,20 @@ def read_replay(
     whole_table = read_table(path)
     table = records(whole_table)
     indices = [_find(path, table, name) for name in names]
-    whole = [i for i, row in enumerate(table) if row["status"] == "complete"]
-    if count > len(whole):
-        raise InputError(f"{path}: {len(whole)} rows of drives; {count} are asked for")
-    drawn = np.random.default_rng(seed).choice(len(whole), count, replace=False)
-    indices = dict.fromkeys([*indices, *(whole[i] for i in sorted(drawn))])
+    complete = [i for i, row in enumerate(table) if row["status"] == "complete"]
+    if count > len(complete):
+        raise InputError(
+            f"{path}: {len(complete)} rows of drives; {count} are asked for"
+        )
+    drawn = np.random.default_rng(seed).choice(len(complete), count, replace=False)
+    indices = dict.fromkeys([*indices, *(complete[i] for i in sorted(drawn))])
     first = {table[i]["cell"]: table[i] for i in indices}
     made = read_made(folder)
     cells = tuple(
         _cell(row, made_of_row(made, folder, name), folder)
         for name, row in first.items()
     )
-    versions = {name: about["versions"] for name, about in made.items()}
+    versions = {name: provenance["versions"] for name, provenance in made.items()}
     return Replay(whole_table, tuple(indices), cells, versions)
 
 
@@ -101,17 +103,18 @@ def take_checkpoints(replay: Replay, folder: Path, output: Path) -> None:
         InputError: a cell's checkpoint is missing, or cannot be copied.
     """
     for cell in replay.cells:
-        found, own = folder_of(folder, cell), folder_of(output, cell)
-        there, here = found / CHECKPOINT, own / CHECKPOINT
-        if not there.exists():
+        source, own = folder_of(folder, cell), folder_of(output, cell)
+        original, target = source / CHECKPOINT, own / CHECKPOINT
+        if not original.exists():
             raise InputError(
-                f"{there}: there is none; without --drives-only, the attack is repeated"
+                f"{original}: there is none; without --drives-only, the attack is "
+                "repeated"
             )
-        if not here.exists():
+        if not target.exists():
             files.make_folder(own)
             files.write_text(own / SCENARIO, cell.text)
             for name in (EFFORT, CHECKPOINT):  # the last tells that all are there
-                raw = files.read_bytes(found / name, files.MAX_TENSOR_BYTES)
+                raw = files.read_bytes(source / name, files.MAX_TENSOR_BYTES)
                 files.write_bytes(own / name, raw)
 
 
@@ -143,17 +146,17 @@ def compare_rows(
         for table in (replay.table, repeated)
     )
     difference = (stored.astype(float) - again.astype(float)).abs()
-    told, asked = [], replay.table.iloc[list(replay.indices)]
+    rows, asked = [], replay.table.iloc[list(replay.indices)]
     for index, labels in zip(replay.indices, records(asked[_DRIVE]), strict=True):
         row, key = {"row": index} | labels, tuple(labels.values())
         sides = {"stored": stored, "repeated": again, "difference": difference.dropna()}
         for name, side in sides.items():
             row[name] = records(side.loc[[key]])[0] if key in side.index else None
-        told.append(row)
+        rows.append(row)
     cells = []
     for cell in replay.cells:
         own = difference[difference.index.get_level_values("cell") == cell.id]
-        there, here = replay.versions[cell.id], made.get(cell.id, {}).get("versions")
+        old, new = replay.versions[cell.id], made.get(cell.id, {}).get("versions")
         both = own.dropna()
         cells.append(
             {
@@ -161,45 +164,45 @@ def compare_rows(
                 "rows": len(both),
                 "unmatched": len(own) - len(both),
                 "largest_difference": _largest(both),
-                "versions": _versions(there, here) if len(both) and here else {},
+                "versions": _versions(old, new) if len(both) and new else {},
                 "error": errors.get(cell.id),
             }
         )
-    known = [row["difference"] for row in told if row["difference"]]
+    known = [row["difference"] for row in rows if row["difference"]]
     largest = _largest(pd.DataFrame(known))
-    return {"rows": told, "cells": cells, "largest_difference": largest}
+    return {"rows": rows, "cells": cells, "largest_difference": largest}
 
 
-def sentences(found: Mapping[str, Any]) -> list[str]:
+def sentences(comparison: Mapping[str, Any]) -> list[str]:
     """Tell of a repetition in words.
 
     Args:
-        found: of :func:`compare_rows`.
+        comparison: of :func:`compare_rows`.
     """
     lines = []
-    for row in found["rows"]:
+    for row in comparison["rows"]:
         name = ":".join(str(row[label]) for label in _DRIVE)
-        lines.append(f"row {row['row']}, {name}: {_told(row)}")
-    for cell in found["cells"]:
-        for name, (there, here) in cell["versions"].items():
-            lines.append(f"{cell['cell']}: {name} {there} then, {here} here")
+        lines.append(f"row {row['row']}, {name}: {_describe_row(row)}")
+    for cell in comparison["cells"]:
+        for name, (old, new) in cell["versions"].items():
+            lines.append(f"{cell['cell']}: {name} {old} then, {new} here")
         if cell["error"] is not None:
             lines.append(f"failed: {cell['cell']}: {cell['error'].splitlines()[-1]}")
             continue
-        told = f"{cell['cell']}: {cell['rows']} rows"
+        sentence = f"{cell['cell']}: {cell['rows']} rows"
         if largest := cell["largest_difference"]:
             error = largest["cross_track_mean_m"]
-            told += f", whose mean errors differ by at most {error:g} m"
+            sentence += f", whose mean errors differ by at most {error:g} m"
         if cell["unmatched"]:
-            told += f"; {cell['unmatched']} in one table alone"
-        lines.append(told)
-    if largest := found["largest_difference"]:
-        told = ", ".join(f"{name} {largest[name]:g}" for name in FIGURES)
-        lines.append(f"largest difference of these rows: {told}")
+            sentence += f"; {cell['unmatched']} in one table alone"
+        lines.append(sentence)
+    if largest := comparison["largest_difference"]:
+        differences = ", ".join(f"{name} {largest[name]:g}" for name in FIGURES)
+        lines.append(f"largest difference of these rows: {differences}")
     return lines
 
 
-def _told(row: Mapping[str, Any]) -> str:
+def _describe_row(row: Mapping[str, Any]) -> str:
     stored, again = row["stored"], row["repeated"]
     if again is None:
         return "there is no such drive this time"
@@ -239,8 +242,8 @@ def _cell(row: Row, made: Mapping[str, Any], folder: Path) -> Cell:
     name, labels = row["cell"], {key: row[key] for key in LABELS[1:]}
     digests, text = dict(made["digests"]), made["scenario"]
     today = upgraded_text(name, text)
-    here = absolute_text(name, today, folder.resolve().parent)
-    cell = Cell(**labels, text=here, digests=digests, anyway=True, name=name)
+    absolute = absolute_text(name, today, folder.resolve().parent)
+    cell = Cell(**labels, text=absolute, digests=digests, anyway=True, name=name)
     if today != text:  # of the first form, whose digest is made of other keys
         digests["scenario"] = cell.scenario.digest()
     if wrong := changed(cell):
@@ -258,9 +261,7 @@ def _largest(differences: pd.DataFrame) -> dict[str, float] | None:
     return {name: float(differences[name].max()) for name in FIGURES}
 
 
-def _versions(
-    there: Mapping[str, str], here: Mapping[str, str]
-) -> dict[str, list[Any]]:
-    names = sorted(there.keys() | here.keys())
-    pairs = {name: [there.get(name), here.get(name)] for name in names}
+def _versions(old: Mapping[str, str], new: Mapping[str, str]) -> dict[str, list[Any]]:
+    names = sorted(old.keys() | new.keys())
+    pairs = {name: [old.get(name), new.get(name)] for name in names}
     return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}

@@ -73,7 +73,7 @@ def write_summary(
     return document
 
 
-def told_attacks(folder: Path) -> dict[str, dict[str, Any]]:
+def summarised_attacks(folder: Path) -> dict[str, dict[str, Any]]:
     """Return the attacks of a folder's ``summary.json`` by cell; none without one.
 
     Raises:
@@ -101,8 +101,8 @@ def read_attacks(
     Args:
         folder: of the sweep.
         table: of the sweep.
-        known: attacks by cell, from :func:`told_attacks` of other folders. A cell's
-            own folder comes first, then the sweep's own summary, then `known`.
+        known: attacks by cell, from :func:`summarised_attacks` of other folders. A
+            cell's own folder comes first, then the sweep's own summary, then `known`.
 
     Returns:
         one row per attack, in the table's order: labels, `attack_method`,
@@ -114,8 +114,8 @@ def read_attacks(
     """
     complete = table[table["status"] == "complete"]
     cells = {row["cell"]: row for row in records(complete.drop_duplicates("cell"))}
-    earlier = {**known, **told_attacks(folder)}
-    found = []
+    earlier = {**known, **summarised_attacks(folder)}
+    attacks = []
     for cell, row in cells.items():
         path = folder / CELLS / cell / METRICS
         if path.exists():
@@ -124,10 +124,10 @@ def read_attacks(
             section = document["scenario"]["attack"]
             attack |= {"section": section, "attack_method": section["method"]["kind"]}
             attack |= {key: document[key] for key in ("converged", "flags")}
-            found.append(attack | {"curve": document.get("curve")})
+            attacks.append(attack | {"curve": document.get("curve")})
         elif cell in earlier:
-            found.append(dict(earlier[cell]))
-    return found
+            attacks.append(dict(earlier[cell]))
+    return attacks
 
 
 def summarise(
@@ -163,18 +163,18 @@ def summarise(
 
 def _groups(drives: pd.DataFrame) -> list[dict[str, Any]]:
     """Summarise groups over their attacks, each of which is a cell."""
-    found = summary(drives, _GROUP, ["cell"], _SEED)
-    if found.empty:
+    figures = summary(drives, _GROUP, ["cell"], _SEED)
+    if figures.empty:
         return []
     groups = drives.groupby(_GROUP, sort=False, dropna=False)
     numbers = groups.agg(places=("scenario", "nunique"), seeds=("seed", "nunique"))
-    found[["places", "seeds"]] = numbers.to_numpy()
-    return records(found[list(_OF_GROUP)])
+    figures[["places", "seeds"]] = numbers.to_numpy()
+    return records(figures[list(_OF_GROUP)])
 
 
 def _comparisons(drives: pd.DataFrame) -> list[dict[str, Any]]:
     """Compare attacks with other cases of theirs, and methods with the gradient."""
-    found = []
+    comparisons = []
     attacked = drives[drives["case"] == ATTACK]
     for _, one in attacked.groupby(_GROUP, sort=False, dropna=False):
         [labels] = records(one[_GROUP].head(1))
@@ -184,11 +184,16 @@ def _comparisons(drives: pd.DataFrame) -> list[dict[str, Any]]:
         for other in others:
             second = _where(drives, other)
             if _attacks(one) & _attacks(second):
-                about = {"other_method": other["method"], "other_case": other["case"]}
+                reference = {
+                    "other_method": other["method"],
+                    "other_case": other["case"],
+                }
                 effect = asdict(compare(one, second, _ERROR, _SEED))
                 left = asdict(compare_departures(one, second))
-                found.append(labels | about | {"effect": effect, "departures": left})
-    return found
+                comparisons.append(
+                    labels | reference | {"effect": effect, "departures": left}
+                )
+    return comparisons
 
 
 def _attacks(drives: pd.DataFrame) -> set[tuple[str, int]]:
@@ -209,7 +214,7 @@ def _black_box(attacks: Iterable[Mapping[str, Any]]) -> Iterator[str]:
         if attack["curve"] is not None:
             place = (attack[name] for name in ("route", "objects", "budget", "seed"))
             by_place.setdefault(tuple(place), []).append(attack)
-    told: dict[tuple[str, str], list[list[str]]] = {}
+    flags_by_method: dict[tuple[str, str], list[list[str]]] = {}
     for own in by_place.values():
         gradients = [attack for attack in own if attack["attack_method"] == GRADIENT]
         if not gradients:
@@ -219,10 +224,11 @@ def _black_box(attacks: Iterable[Mapping[str, Any]]) -> Iterator[str]:
         for attack in own:
             if attack["attack_method"] not in _NOT_COMPARED:
                 name = f"{attack['method']} ({attack['cell']})"
-                curves = gradient["curve"], {name: attack["curve"]}
                 key = attack["route"], attack["method"]
-                told.setdefault(key, []).append(list(black_box_better(*curves)))
-    for (route, method), flags in told.items():
+                flags_by_method.setdefault(key, []).append(
+                    list(black_box_better(gradient["curve"], {name: attack["curve"]}))
+                )
+    for (route, method), flags in flags_by_method.items():
         if better := list(chain.from_iterable(flags)):
             share = f"{len(better)} of {len(flags)} comparisons on {route}"
             yield f"{better[0]}; {method} is better in {share}"
@@ -240,17 +246,17 @@ def _noise(comparisons: Iterable[Mapping[str, Any]]) -> Iterator[str]:
 
 def _own_flags(attacks: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Tell of each flag that attacks raised how many did, and what the first said."""
-    told: dict[str, list[tuple[str, str]]] = {}
+    occurrences: dict[str, list[tuple[str, str]]] = {}
     for attack in attacks:
         by_name = {}
         for flag in attack["flags"]:
-            name, _, rest = flag.partition(": ")
-            by_name.setdefault(name, (attack["cell"], rest))
+            name, _, remark = flag.partition(": ")
+            by_name.setdefault(name, (attack["cell"], remark))
         for name, first in by_name.items():
-            told.setdefault(name, []).append(first)
-    for name, raised in told.items():
-        cell, rest = raised[0]
-        yield f"{name}: in {len(raised)} of {len(attacks)} attacks; in {cell}: {rest}"
+            occurrences.setdefault(name, []).append(first)
+    for name, raised in occurrences.items():
+        cell, remark = raised[0]
+        yield f"{name}: in {len(raised)} of {len(attacks)} attacks; in {cell}: {remark}"
 
 
 @dataclass(frozen=True)
@@ -283,7 +289,11 @@ def read_taken(folders: Iterable[Path]) -> Taken:
         table = read_table(folder / RESULTS)
         groups = table[table["status"] == "complete"].groupby("cell", sort=False)
         own = {str(cell): records(drives) for cell, drives in groups}
-        made = {cell: about for cell, about in read_made(folder).items() if cell in own}
-        attacks = told_attacks(folder) | dict(taken.attacks)
+        made = {
+            cell: provenance
+            for cell, provenance in read_made(folder).items()
+            if cell in own
+        }
+        attacks = summarised_attacks(folder) | dict(taken.attacks)
         taken = Taken(own | dict(taken.rows), made | dict(taken.made), attacks)
     return taken

@@ -94,7 +94,7 @@ class Sweep:
             copy.
         steps: control periods that the cells have reported.
         complete: cells that are done, by their index.
-        kept: number of cells that were done when this run began.
+        already_complete: number of cells that were done when this run began.
         errors: why other cells failed at their last attempt.
     """
 
@@ -103,7 +103,7 @@ class Sweep:
     taken: Taken = field(default_factory=Taken)
     steps: int = 0
     complete: set[int] = field(default_factory=set)
-    kept: int = 0
+    already_complete: int = 0
     errors: dict[int, str] = field(default_factory=dict)
     _rows: dict[int, list[Row]] = field(default_factory=dict)
     _made: dict[int, dict[str, Any]] = field(default_factory=dict)
@@ -143,7 +143,7 @@ class Sweep:
                     self._made[index] = self.taken.made[cell.id]
                 elif (path := self._failure(index)).exists():
                     self._fail(index, files.read_text(path))
-            self.kept = len(self.complete)
+            self.already_complete = len(self.complete)
             self._write()
             for _ in range(ATTEMPTS):
                 ended = self.complete | self._refused
@@ -177,8 +177,8 @@ class Sweep:
         self.complete.add(index)
         cell, folder = self.work.cells[index], self.work.folder
         self._rows[index] = complete_rows(cell, folder)
-        about = files.read_json(folder_of(folder, cell) / PROVENANCE)
-        self._made[index] = made_of(cell, about["versions"])
+        provenance = files.read_json(folder_of(folder, cell) / PROVENANCE)
+        self._made[index] = made_of(cell, provenance["versions"])
 
     def _fail(self, index: int, error: str) -> None:
         self.errors[index], cell = error, self.work.cells[index]

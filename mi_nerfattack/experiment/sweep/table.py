@@ -9,10 +9,10 @@ from typing import Any
 import pandas as pd
 
 from mi_nerfattack.drives.table import (
+    INTEGER,
     NUMBER,
     TEXT,
     TRUTH,
-    WHOLE,
     read_csv,
     write_csv,
 )
@@ -33,13 +33,13 @@ COLUMNS = {
     "route": TEXT,
     "objects": TEXT,
     "method": TEXT,
-    "budget": WHOLE,
-    "seed": WHOLE,
+    "budget": INTEGER,
+    "seed": INTEGER,
     "environment": TEXT,
     "case": TEXT,
-    "run": WHOLE,
-    "frames": WHOLE,
-    "steps": WHOLE,
+    "run": INTEGER,
+    "frames": INTEGER,
+    "steps": INTEGER,
     "cross_track_mean_m": NUMBER,
     "wheel_out_s": NUMBER,
     "departed": TRUTH,
@@ -118,8 +118,8 @@ def read_table(path: Path) -> pd.DataFrame:
     """
     table = read_csv(path, COLUMNS)
     drives = table[table["status"] == "complete"]
-    told = table["status"].isin(["complete", "failed"])
-    if not told.all() or drives[_OF_DRIVE].isna().any(axis=None):
+    is_known = table["status"].isin(["complete", "failed"])
+    if not is_known.all() or drives[_OF_DRIVE].isna().any(axis=None):
         raise InputError(
             f"{path}: damaged: a drive has no figures; give the sweep's command again, "
             "which makes the table again"

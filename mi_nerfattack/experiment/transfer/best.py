@@ -59,9 +59,9 @@ def best_attacks(sweeps: Sequence[Path], of_route: int) -> list[Path]:
         by = ["route", "seed", "method", "cell"]
         for row in records(summary(own, by, ["cell"])):
             known = best.setdefault(row["route"], {})
-            found = row["cross_track_mean_m"], folder / CELLS / row["cell"]
+            candidate = row["cross_track_mean_m"], folder / CELLS / row["cell"]
             place = row["seed"], row["method"]
-            known[place] = max(found, known.get(place, found))
+            known[place] = max(candidate, known.get(place, candidate))
     ranked = {route: sorted(own.values(), reverse=True) for route, own in best.items()}
     for route, pairs in ranked.items():
         if len(pairs) < of_route:

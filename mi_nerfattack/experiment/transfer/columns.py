@@ -14,7 +14,7 @@ from mi_nerfattack.deploy.stress.timing import DroppedFrames, LateControls, Late
 from mi_nerfattack.deploy.surrogate.environment import SurrogateEnvironment
 from mi_nerfattack.deploy.surrogate.scene import showing
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.ranges import Finite, NonNegative, Share, Whole, checked
+from mi_nerfattack.ranges import Finite, Natural, NonNegative, Share, checked
 from mi_nerfattack.render.camera.rig import camera_seed
 from mi_nerfattack.render.pathtrace.load import DAYLIGHT
 from mi_nerfattack.render.posed import PosedField
@@ -68,8 +68,8 @@ class Condition:
     noise_sd: NonNegative = 0.0
     blur_px: NonNegative = 0.0
     dropped_share: Share = 0.0
-    late_periods: Whole = 0
-    latency_periods: Whole = 0
+    late_periods: Natural = 0
+    latency_periods: Natural = 0
     placement_m: NonNegative = 0.0
     turn_deg: NonNegative = 0.0
     pitch_deg: NonNegative = 0.0
@@ -88,13 +88,13 @@ class Condition:
     @property
     def label(self) -> str:
         """As `parse_condition` reads it: ``day``, ``evening,noise:0.03``."""
-        parts = [] if self.sky == "day" else [self.sky]
+        terms = [] if self.sky == "day" else [self.sky]
         for word, name in _WORDS.items():
             if value := getattr(self, name):
                 sign = "+" * (word == "exposure" and value > 0)
-                parts.append(f"{word}:{sign}{value:g}")
-        parts += [f"{word}:{value:g}" for word, value in self.others]
-        return ",".join(parts) or "day"
+                terms.append(f"{word}:{sign}{value:g}")
+        terms += [f"{word}:{value:g}" for word, value in self.others]
+        return ",".join(terms) or "day"
 
     def around(self, environment: AbstractEnvironment) -> AbstractEnvironment:
         """Let frames and controls of an environment be late or lost."""
@@ -162,7 +162,7 @@ def parse_condition(text: str) -> Condition:
                 "parted by commas"
             )
         try:
-            kind = int if kinds.get(name) == "Whole" else float
+            kind = int if kinds.get(name) == "Natural" else float
             values[name] = word if name == "sky" else kind(number)
         except ValueError as err:
             raise InputError(f"--conditions: {text!r}: {word}: {err}") from err
@@ -212,11 +212,11 @@ class Column:
 
     def identity(self) -> dict[str, Any]:
         """Return all that decides about its drives, as JSON."""
-        found = {"environment": self.environment, **self.condition.identity()}
+        identity = {"environment": self.environment, **self.condition.identity()}
         traced = (
             self.name in ("mitsuba", "mujoco") or self.environment not in ENVIRONMENTS
         )
-        return found | ({"spp": self.spp} if traced else {})
+        return identity | ({"spp": self.spp} if traced else {})
 
     def check(self, scenario: Scenario) -> None:
         """Raise InputError unless a scenario's vehicle can drive there."""
@@ -248,9 +248,9 @@ class Column:
         blur, noise = condition.blur_px, condition.noise_sd
         if self.environment == SURROGATE:
             sensor = showing(world.surrogate, list(objects), mounts=mounts)
-            found = SurrogateEnvironment(sensor, kinematic_vehicle(place))
-            found.blur_px, found.noise_sd = blur, noise
-            return condition.around(found)
+            environment = SurrogateEnvironment(sensor, kinematic_vehicle(place))
+            environment.blur_px, environment.noise_sd = blur, noise
+            return condition.around(environment)
         light = Conditions(
             condition.sky,
             condition.exposure_ev,
@@ -280,22 +280,22 @@ def make_columns(
         if name not in ENVIRONMENTS:
             offered_environment(name, "--environments: ", ENVIRONMENTS)
     parsed = [parse_condition(text) for text in conditions]
-    for option, given in (("environments", environments), ("conditions", parsed)):
-        if not given or len(set(given)) < len(given):
+    for option, choices in (("environments", environments), ("conditions", parsed)):
+        if not choices or len(set(choices)) < len(choices):
             words = environments if option == "environments" else conditions
             raise InputError(
                 f"--{option}: {' '.join(words)!r}; at least one, each once"
             )
     Conditions(spp=spp)  # checks it
-    found = tuple(
+    columns = tuple(
         Column(name, condition, spp)
         for name in environments
         for condition in parsed
         if name != SURROGATE or not condition.is_light
     )
-    if not found:
+    if not columns:
         raise InputError(
             "--conditions: the surrogate has the light of its field; give a condition "
             "of another kind, or further environments"
         )
-    return found
+    return columns

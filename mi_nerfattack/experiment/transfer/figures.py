@@ -44,9 +44,9 @@ def case_figures(
         the figures of `metrics.summarise`, and ``departure_rate_ci95`` (Wilson) of
         the share of drives that left the lane.
     """
-    found = work.attacks[batch.number]
-    lanes = {found.route.name: found.lane}
-    by_case = summarise(drives, lanes, work.seed)[found.route.name]
+    attack = work.attacks[batch.number]
+    lanes = {attack.route.name: attack.lane}
+    by_case = summarise(drives, lanes, work.seed)[attack.route.name]
     figures = by_case[batch.column.environment][batch.case]
     left = share_interval(figures["drives_departed"], figures["n"])
     return {**figures, "departure_rate_ci95": left}
@@ -82,20 +82,20 @@ def make_document(work: TransferDrives, figures: Figures) -> dict[str, Any]:
             column.condition.label: column.condition.identity()
             for column in sorted(work.columns, key=lambda c: c.environment == SURROGATE)
         },
-        "attacks": [_about(found) for found in work.attacks],
+        "attacks": [_describe(attack) for attack in work.attacks],
         "rows": rows,
         "columns": column_figures(rows, _drives(rows), work.seed) if complete else [],
         "surrogates": _surrogates(work, rows) if complete else [],
     }
 
 
-def _about(found: FoundAttack) -> dict[str, Any]:
+def _describe(attack: FoundAttack) -> dict[str, Any]:
     return {
-        **found.about,
-        "folder": str(found.folder),
-        "policy": found.scenario.policy.source,
-        "surrogate": dict(found.surrogate),
-        "departure_limit_m": found.lane.wheel_m,
+        **attack.description,
+        "folder": str(attack.folder),
+        "policy": attack.scenario.policy.source,
+        "surrogate": dict(attack.surrogate),
+        "departure_limit_m": attack.lane.wheel_m,
     }
 
 
@@ -132,12 +132,12 @@ def compare_rows(rows: Sequence[Row]) -> None:
         if (row["environment"], row["condition"]) == (SURROGATE, "day")
     }
     for row in rows:
-        here, base = row["cases"].get(ATTACK), bases.get(row["attack"])
+        case, base = row["cases"].get(ATTACK), bases.get(row["attack"])
         ratio = None
-        if here and base and base["cross_track_mean_m"] > 0:
-            ratio = here["cross_track_mean_m"] / base["cross_track_mean_m"]
+        if case and base and base["cross_track_mean_m"] > 0:
+            ratio = case["cross_track_mean_m"] / base["cross_track_mean_m"]
         row["ratio_to_surrogate"] = ratio
-        row["succeeds"] = None if here is None else _is_out(here)
+        row["succeeds"] = None if case is None else _is_out(case)
         row["succeeds_in_surrogate"] = None if base is None else _is_out(base)
 
 
@@ -160,12 +160,12 @@ def column_figures(
         environment, condition, case = (figures[name] for name in by)
         own = cases.setdefault((environment, condition), {})
         own[case] = {name: figures[name] for name in _OF_CASE}
-    found = []
+    columns = []
     for key, of_case in cases.items():
         own = [r for r in rows if (r["environment"], r["condition"]) == key]
         ratios = [r for row in own if (r := row["ratio_to_surrogate"])]
         mean = float(np.exp(np.log(ratios).mean())) if len(ratios) == len(own) else None
-        found.append(
+        columns.append(
             {
                 "environment": key[0],
                 "condition": key[1],
@@ -175,34 +175,34 @@ def column_figures(
                 "transfer": _transfer(own),
             }
         )
-    return found
+    return columns
 
 
 def _drives(rows: Sequence[Row]) -> pd.DataFrame:
-    found = [
+    runs = [
         {name: row[name] for name in ("attack", "environment", "condition")}
         | {"case": case, **run, "departed": run["steps_departed"] > 0}
         for row in rows
         for case, figures in row["cases"].items()
         for run in figures["per_run"]
     ]
-    return pd.DataFrame(found)
+    return pd.DataFrame(runs)
 
 
 def _surrogates(work: TransferDrives, rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Summarise attacks by surrogate, the worst first; none if there is one."""
     groups: dict[str, list[FoundAttack]] = {}
-    for found in work.attacks:
-        groups.setdefault(found.surrogate["sha256"], []).append(found)
+    for attack in work.attacks:
+        groups.setdefault(attack.surrogate["sha256"], []).append(attack)
     if len(groups) < 2:
         return []
     summaries = []
     for group in groups.values():
-        labels = [found.label for found in group]
+        labels = [attack.label for attack in group]
         own = [row for row in rows if row["attack"] in labels]
         columns = column_figures(own, _drives(own), work.seed)
-        about = dict(group[0].surrogate)
-        summaries.append({**about, "attacks": labels, "columns": columns})
+        surrogate = dict(group[0].surrogate)
+        summaries.append({**surrogate, "attacks": labels, "columns": columns})
     unknown = float("inf")
     return sorted(
         summaries,
@@ -215,9 +215,9 @@ def _transfer(rows: Sequence[Row]) -> dict[str, Any] | None:
     some = [row for row in rows if row["succeeds_in_surrogate"]]
     if not some or some[0]["succeeds"] is None:
         return None
-    kept = sum(row["succeeds"] for row in some)
-    ci95 = share_interval(kept, len(some))
-    return {"of": len(some), "kept": kept, "rate_ci95": ci95}
+    successes = sum(row["succeeds"] for row in some)
+    ci95 = share_interval(successes, len(some))
+    return {"of": len(some), "kept": successes, "rate_ci95": ci95}
 
 
 def _is_out(case: dict[str, Any]) -> bool:
@@ -262,8 +262,8 @@ def run_transfer(
     figures: dict[str, dict[str, Any]] = {}
     document: dict[str, Any] = {"rows": None}
 
-    def on_groups(found: Groups) -> None:
-        for index, items in found.items():
+    def on_groups(groups: Groups) -> None:
+        for index, items in groups.items():
             batch = work.batches[index]
             drives = [item.drive for item in items]
             figures[batch.digest] = case_figures(work, batch, drives)

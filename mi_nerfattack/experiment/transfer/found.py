@@ -79,7 +79,7 @@ class FoundAttack:
         return Lane.of(self.route, self.scenario.vehicle.width_m)
 
     @property
-    def about(self) -> dict[str, Any]:
+    def description(self) -> dict[str, Any]:
         """What documents say of it."""
         return {
             "label": self.label,
@@ -110,10 +110,10 @@ class FoundAttack:
         """Raise InputError if the attack has seen one of the starts."""
         scenario, route = self.scenario, self.route
         evaluated = initial_states(scenario, route, scenario.drive.runs, 0)
-        seen = np.concatenate([evaluated, optimised_states(scenario, route)])
+        poses = np.concatenate([evaluated, optimised_states(scenario, route)])
         for number in range(count):
             pose, _ = self.start(seed, number)
-            if np.isclose(seen, pose, rtol=0, atol=1e-6).all(1).any():
+            if np.isclose(poses, pose, rtol=0, atol=1e-6).all(1).any():
                 raise InputError(
                     f"{self.folder}: start {number} is one of the run's own; drives "
                     "from there tell nothing new. Its scenario's [drive] must let "
@@ -132,10 +132,10 @@ class FoundAttack:
                     f"{path}: {len(attacked[-1])} vertices, the object of the scenario "
                     f"has {len(texture)}; {_REMEDY}"
                 )
-        found = {OWN: own, ATTACK: Appearance(attacked, self.offsets)}
+        looks = {OWN: own, ATTACK: Appearance(attacked, self.offsets)}
         if self.best_random is not None:
-            found[BEST_RANDOM] = RandomAppearances.of(world, own)(self.best_random)
-        return found
+            looks[BEST_RANDOM] = RandomAppearances.of(world, own)(self.best_random)
+        return looks
 
 
 def read_found(folders: Sequence[Path]) -> tuple[FoundAttack, ...]:
@@ -185,8 +185,8 @@ def check_unchanged(checkpoint: Path, identity: Mapping[str, str]) -> None:
     if not checkpoint.is_file():  # it takes much room, and may have been removed
         return
     _, metadata = files.read_safetensors(checkpoint, ())
-    kept = {key: value for key, value in metadata.items() if key in identity}
-    refuse(checkpoint, differences(kept, identity), _REMEDY)
+    recorded = {key: value for key, value in metadata.items() if key in identity}
+    refuse(checkpoint, differences(recorded, identity), _REMEDY)
 
 
 def _surrogate(scene: SceneSection, identity: Mapping[str, str]) -> dict[str, Any]:
@@ -206,5 +206,5 @@ def _surrogate(scene: SceneSection, identity: Mapping[str, str]) -> dict[str, An
         with suppress(KeyError, ValueError):  # written by somebody else
             number = kind(header[f"fit.{name}"])
             numbers[name] = number if math.isfinite(number) else None
-    about = json.loads(identity[f"scenario.scene.{key}"])
-    return {"file": str(named), "sha256": about["sha256"], **numbers}
+    file_identity = json.loads(identity[f"scenario.scene.{key}"])
+    return {"file": str(named), "sha256": file_identity["sha256"], **numbers}

@@ -79,28 +79,28 @@ class TransferDrives(AbstractDrives):
         for case in self.cases:
             if case not in CASES:
                 raise InputError(f"--cases: {case!r}; of {', '.join(CASES)}")
-        for found in self.attacks:
-            if BEST_RANDOM in self.cases and found.best_random is None:
+        for attack in self.attacks:
+            if BEST_RANDOM in self.cases and attack.best_random is None:
                 raise InputError(
-                    f"{found.folder}: has no random textures; leave {BEST_RANDOM} out "
+                    f"{attack.folder}: has no random textures; leave {BEST_RANDOM} out "
                     "of --cases"
                 )
-            found.check_starts(self.seed, self.starts)
+            attack.check_starts(self.seed, self.starts)
             for column in self.columns:
-                column.check(found.scenario)
+                column.check(attack.scenario)
 
     @cached_property
     def rows(self) -> dict[tuple[int, Column], dict[str, Batch]]:
         """Batches by case, of each attack in each column."""
         known: dict[str, Batch] = {}
-        found: dict[tuple[int, Column], dict[str, Batch]] = {}
+        rows: dict[tuple[int, Column], dict[str, Batch]] = {}
         for number, _ in enumerate(self.attacks):
             for column in self.columns:
                 batches = [self._batch(number, column, case) for case in self.cases]
                 batches = [known.setdefault(b.digest, b) for b in batches]
                 cells = zip(self.cases, batches, strict=True)
-                found[number, column] = dict(cells)
-        return found
+                rows[number, column] = dict(cells)
+        return rows
 
     @cached_property
     def batches(self) -> list[Batch]:
@@ -126,36 +126,36 @@ class TransferDrives(AbstractDrives):
         Raises:
             InputError: one cannot be made.
         """
-        driver, seen = self.open(), set()
+        driver, opened = self.open(), set()
         for spec in missing:
-            batch, _ = spec.how
-            column, found = batch.column, self.attacks[batch.number]
-            scene = found.identity["scenario.scene.deployment"]
+            batch, _ = spec.context
+            column, attack = batch.column, self.attacks[batch.number]
+            scene = attack.identity["scenario.scene.deployment"]
             key = scene, column.name, column.condition.sky
-            if key not in seen:
-                seen.add(key)
+            if key not in opened:
+                opened.add(key)
                 column.open(driver.world(batch.number), [], 0).close()
         driver.close()
 
     def _batch(self, number: int, column: Column, case: str) -> Batch:
         """Describe all that decides about drives, and nothing else."""
         column = column.without_objects if case == NO_OBJECT else column
-        found = _decisive(self.attacks[number], column, case)
-        found |= {"column": column.identity(), "case": case, "seed": self.seed}
-        return Batch(number, column, case, identify(column.name, found))
+        identity = _decisive(self.attacks[number], column, case)
+        identity |= {"column": column.identity(), "case": case, "seed": self.seed}
+        return Batch(number, column, case, identify(column.name, identity))
 
     def _spec(self, batch: Batch, start: int) -> DriveSpec:
-        found = self.attacks[batch.number]
-        pose, seed = found.start(self.seed, start)
+        attack = self.attacks[batch.number]
+        pose, seed = attack.start(self.seed, start)
         return DriveSpec(
             environment=batch.column.environment,
-            route=found.route.name,
+            route=attack.route.name,
             case=batch.case,
             run=start,
             seed=seed,
-            steps=found.horizon,
+            steps=attack.horizon,
             identity={**batch.identity, "start": f"{start}"},
-            how=(batch, pose),
+            context=(batch, pose),
         )
 
 
@@ -173,17 +173,17 @@ class TransferDriver(AbstractDriver):
         """Return the world of an attack."""
         if self._world is None or self._number != number:
             self.close()
-            found = self._attacks[number]
-            scenario = found.scenario
+            attack = self._attacks[number]
+            scenario = attack.scenario
             policy = scenario.policy.build(scenario.rig().views)
             world = build_world(scenario, policy)
             self._world, self._number = world, number
-            self._looks = found.looks(world)
+            self._looks = attack.looks(world)
         return self._world
 
     def drive(self, spec: DriveSpec, on_step: OnStep) -> Drive:
         """Drive once, the objects in their places."""
-        batch, pose = spec.how
+        batch, pose = spec.context
         world, column = self.world(batch.number), batch.column
         if batch.case != NO_OBJECT:
             look, errors = self._looks[batch.case], column.condition.errors
@@ -213,18 +213,18 @@ class TransferDriver(AbstractDriver):
         self._world, self._looks = None, {}
 
 
-def _decisive(found: FoundAttack, column: Column, case: str) -> dict[str, str]:
+def _decisive(attack: FoundAttack, column: Column, case: str) -> dict[str, str]:
     """Return what of a scenario, and of what was found, decides about drives."""
     inert: list[str] = []
     named = {}
     if case == NO_OBJECT:
         inert.append("objects")
     if case in (ATTACK, BEST_RANDOM):
-        named["found"] = found.digest
+        named["found"] = attack.digest
     if case == BEST_RANDOM:
-        scenario = found.scenario
-        look = scenario.seed, scenario.baseline.kind, found.best_random
+        scenario = attack.scenario
+        look = scenario.seed, scenario.baseline.kind, attack.best_random
         named["look"] = json.dumps(look)
     in_surrogate = column.environment == SURROGATE
-    driven = decisive(found.scenario, found.identity, in_surrogate).items()
+    driven = decisive(attack.scenario, attack.identity, in_surrogate).items()
     return named | {k: value for k, value in driven if not is_within(k, inert)}

@@ -65,8 +65,8 @@ class FrameSource:
         if drive.environment == SURROGATE:
             world = self.viewed.world
             sensor = self._bare if case == NO_OBJECT else world.surrogate
-            seen = sensor.observe(to_state(drive.poses[step][None]), step)
-            return np.round(255 * np.array(seen.image)[0]).astype(np.uint8)
+            observation = sensor.observe(to_state(drive.poses[step][None]), step)
+            return np.round(255 * np.array(observation.image)[0]).astype(np.uint8)
         with self._environment(drive.environment, case, bool(moved)) as environment:
             route = self.viewed.world.route
             frame = environment.reset(route, drive.poses[0], drive.seed)
@@ -77,14 +77,18 @@ class FrameSource:
             return frame.image
 
     def difference(
-        self, drive: Drive, step: int, seen: np.ndarray, moved: Mapping[int, np.ndarray]
+        self,
+        drive: Drive,
+        step: int,
+        image: np.ndarray,
+        moved: Mapping[int, np.ndarray],
     ) -> np.ndarray | None:
         """Show where a frame differs from the frame with original textures.
 
         Args:
             drive: as of :meth:`see`.
             step: as of :meth:`see`.
-            seen: what :meth:`see` returned.
+            image: what :meth:`see` returned.
             moved: as of :meth:`see`.
 
         Returns:
@@ -93,7 +97,7 @@ class FrameSource:
         """
         if drive.case in (NO_OBJECT, OWN):
             return None
-        return heat(seen, self.see(drive, step, OWN, moved))
+        return heat(image, self.see(drive, step, OWN, moved))
 
     def close(self) -> None:
         """Close all environments."""

@@ -117,9 +117,9 @@ def write_view(
         recording = server.get_scene_serializer()
         try:
             for step, pose in enumerate(viewed.cameras(drive)):
-                seen = frames.see(drive, step)
-                apart = frames.difference(drive, step, seen, NOWHERE)
-                scene.look_from(pose, seen)
+                image = frames.see(drive, step)
+                apart = frames.difference(drive, step, image, NOWHERE)
+                scene.look_from(pose, image)
                 scene.tell(describe(viewed, drive, step), apart)
                 recording.insert_sleep(viewed.world.scenario.vehicle.dt_s)
                 on_frame(step + 1, total)

@@ -53,13 +53,13 @@ def scene_cloud(
     """
     sensor = world.without_objects().through(0)
     environment = SurrogateEnvironment(sensor, kinematic_vehicle(world.place))
-    rays, parts = PixelRays(sensor.intrinsics), []
+    rays, clouds = PixelRays(sensor.intrinsics), []
     places = _places(states)
     for number, pose in enumerate(places, start=1):
-        parts.append(frame_points(environment.reset(world.route, pose), rays))
+        clouds.append(frame_points(environment.reset(world.route, pose), rays))
         on_frame(number, len(places))
-    points = np.concatenate([part.points for part in parts])
-    colours = np.concatenate([part.colours for part in parts])
+    points = np.concatenate([cloud.points for cloud in clouds])
+    colours = np.concatenate([cloud.colours for cloud in clouds])
     return thinned(Cloud(points, colours))
 
 
@@ -76,10 +76,10 @@ def frame_points(frame: CameraFrame, rays: PixelRays) -> Cloud:
     pose = frame.camera_to_world
     depth = np.minimum(frame.depth.astype(np.float64), 2 * FARTHEST_M)
     apart = np.abs(depth - ndimage.median_filter(depth, 3, mode="nearest"))
-    kept = (depth < FARTHEST_M) & (apart < SAME * depth)
-    along = rays.at(pose).direction.numpy().T.reshape(*depth.shape, 3)[kept]
-    points = pose[:3, 3] + along * depth[kept][:, None]
-    return Cloud(points, frame.image[kept])
+    mask = (depth < FARTHEST_M) & (apart < SAME * depth)
+    along = rays.at(pose).direction.numpy().T.reshape(*depth.shape, 3)[mask]
+    points = pose[:3, 3] + along * depth[mask][:, None]
+    return Cloud(points, frame.image[mask])
 
 
 def thinned(cloud: Cloud, cell_m: float = CELL_M, most: int = MOST) -> Cloud:
@@ -103,8 +103,8 @@ def _places(states: np.ndarray) -> np.ndarray:
     """Choose poses (m, 3) along a drive, four headings a place."""
     steps = np.linalg.norm(np.diff(states[:, :2], axis=0), axis=1)
     passed = np.concatenate([[0.0], np.cumsum(steps)])
-    wanted = np.arange(0.0, passed[-1] + APART_M, APART_M)
-    chosen = np.unique(np.searchsorted(passed, wanted).clip(max=len(states) - 1))
+    distances = np.arange(0.0, passed[-1] + APART_M, APART_M)
+    chosen = np.unique(np.searchsorted(passed, distances).clip(max=len(states) - 1))
     places = np.repeat(states[chosen], 4, axis=0)
     places[:, 2] += np.tile(np.arange(4) * np.pi / 2, len(chosen))
     return places

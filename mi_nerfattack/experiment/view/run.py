@@ -27,13 +27,13 @@ class ViewedRun:
     """A finished run, with all that its frames are rendered from.
 
     Attributes:
-        found: the attack.
+        attack: of the run.
         world: in which its frames are rendered.
         looks: how the objects look and where they stand, by case; None: nowhere.
         drives: all of them.
     """
 
-    found: FoundAttack
+    attack: FoundAttack
     world: World
     looks: Mapping[str, Appearance | None]
     drives: tuple[Drive, ...]
@@ -93,8 +93,8 @@ def read_viewed(folder: Path) -> ViewedRun:
         InputError: it holds no finished attack, its drives were removed, or a file
             that its scenario names is missing or has changed.
     """
-    (found,) = read_found([folder])
-    values = found.scenario.model_dump(mode="json")
+    (attack,) = read_found([folder])
+    values = attack.scenario.model_dump(mode="json")
     drives = tuple(
         replace(drive, environment=upgraded_environment(drive.environment, values))
         for drive in read_drives(folder / DRIVES)
@@ -103,8 +103,8 @@ def read_viewed(folder: Path) -> ViewedRun:
         raise InputError(
             f"{folder / DRIVES}: no drives; they were removed, attack anew"
         )
-    world = build_world(found.scenario, found.scenario.build_policy())
-    return ViewedRun(found, world, {NO_OBJECT: None, **found.looks(world)}, drives)
+    world = build_world(attack.scenario, attack.scenario.build_policy())
+    return ViewedRun(attack, world, {NO_OBJECT: None, **attack.looks(world)}, drives)
 
 
 def drive_name(drive: Drive) -> str:

@@ -94,20 +94,20 @@ def object_shapes(viewed: ViewedRun) -> list[ObjectShape]:
 
     Cost: a second or so an object.
     """
-    world, found = viewed.world, []
+    world, shapes = viewed.world, []
     cases = [case for case, look in viewed.looks.items() if look is not None]
     for field in world.fields:
         try:
             surface = field_surface(field)
         except InputError:  # a mist, which has none
-            found.append(ObjectShape(None, {}))
+            shapes.append(ObjectShape(None, {}))
             continue
         looks = {}
         for case in cases:
             viewed.show(case, {})
             looks[case] = seen_colours(field, surface.vertices, surface.normals)
-        found.append(ObjectShape(surface, looks))
-    return found
+        shapes.append(ObjectShape(surface, looks))
+    return shapes
 
 
 class RunScene:
@@ -248,8 +248,8 @@ class RunScene:
     def _add_line(self, name: str, points: np.ndarray, colour: Any, m: float) -> None:
         """Draw a line through points (n, 2) of the ground."""
         raised = np.column_stack([points, np.full(len(points), _UP_M)])
-        parts = np.stack([raised[:-1], raised[1:]], axis=1)
-        self._scene.add_line_segments(name, parts, colour, thickness=m)
+        segments = np.stack([raised[:-1], raised[1:]], axis=1)
+        self._scene.add_line_segments(name, segments, colour, thickness=m)
 
 
 def first_look(viewed: ViewedRun, drive: Drive) -> tuple[np.ndarray, np.ndarray]:

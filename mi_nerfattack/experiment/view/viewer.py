@@ -34,7 +34,7 @@ CLOUD = (
     "Points: where rays of the drives' own camera end in the surrogate's field. "
     "Objects: the surface where their fields are half opaque, in their own colours."
 )
-SEEN, WOULD_SEE = "What the policy saw", "What the policy would see"
+RECORDED_LABEL, MOVED_LABEL = "What the policy saw", "What the policy would see"
 HAND_MOVED = (
     "**Moved by hand**: the car stays on the recorded drive, and no policy saw this."
 )
@@ -113,29 +113,29 @@ class Viewer:
             if number not in moved:
                 self._put(number, pose.translation, to_wxyz(pose.rotation))
         try:
-            seen = self.frames.see(drive, step, moved=moved)
-            apart = self.frames.difference(drive, step, seen, moved)
+            image = self.frames.see(drive, step, moved=moved)
+            apart = self.frames.difference(drive, step, image, moved)
         except NerfAttackError as err:  # as a simulator that does not run here
-            self.told.content = f"**No frame**: {err}"
+            self.description.content = f"**No frame**: {err}"
             return
-        self.seen.image = seen
-        self.seen.label = WOULD_SEE if moved else SEEN
-        self.scene.look_from(self.viewed.cameras(drive)[step], seen)
+        self.picture.image = image
+        self.picture.label = MOVED_LABEL if moved else RECORDED_LABEL
+        self.scene.look_from(self.viewed.cameras(drive)[step], image)
         self.apart.visible = apart is not None
         if apart is not None:
             self.apart.image = apart
-        told = [describe(self.viewed, drive, step), *([HAND_MOVED] if moved else [])]
-        self.told.content = "\n\n".join(told)
+        lines = [describe(self.viewed, drive, step), *([HAND_MOVED] if moved else [])]
+        self.description.content = "\n\n".join(lines)
 
     def _add_time(self, gui: viser.GuiApi, drive: Drive) -> None:
         names = [drive_name(item) for item in self.viewed.shown]
         self.choice = gui.add_dropdown("Drive", names, initial_value=drive_name(drive))
         self.slider = gui.add_slider("Period", 0, len(drive.controls), 1, 0)
         self.play = gui.add_button("Play")
-        self.told = gui.add_markdown("")
+        self.description = gui.add_markdown("")
         width, height = self.viewed.world.place.rig.size
         black = np.zeros((height, width, 3), np.uint8)
-        self.seen = gui.add_image(black, label=SEEN, format="png")
+        self.picture = gui.add_image(black, label=RECORDED_LABEL, format="png")
         label = "Where the attack acts: difference to the objects' own textures"
         self.apart = gui.add_image(black, label=label, format="png")
         for handle in (self.choice, self.slider):
@@ -177,7 +177,7 @@ class Viewer:
                 handle.visible = handles.value
 
         handles.on_update(hide)
-        folder = self.viewed.found.folder
+        folder = self.viewed.attack.folder
         pictures = {title: folder / name for name, title in _PICTURES.items()}
         pictures = {title: path for title, path in pictures.items() if path.is_file()}
         if pictures:
@@ -204,9 +204,9 @@ class Viewer:
 
     def _type(self, number: int, event: Any) -> None:
         """Note which position was typed; what was dragged comes here, too."""
-        handle, wanted = self.handles[number], np.array(self.positions[number].value)
-        if np.abs(handle.position - wanted).max() > _SAME_M:
-            handle.position = wanted
+        handle, position = self.handles[number], np.array(self.positions[number].value)
+        if np.abs(handle.position - position).max() > _SAME_M:
+            handle.position = position
             self._drag(number, event)
 
     def _put(self, number: int, position: np.ndarray, wxyz: np.ndarray) -> None:
@@ -230,10 +230,10 @@ def describe(viewed: ViewedRun, drive: Drive, step: int) -> str:
     route, dt_s = viewed.world.route, viewed.world.scenario.vehicle.dt_s
     error = float(route.cross_track_numpy(drive.states[step][None])[0])
     side = "left" if error > 0 else "right"
-    told = f"{step * dt_s:.1f} s: {abs(error):.2f} m {side} of the lane's centre"
+    text = f"{step * dt_s:.1f} s: {abs(error):.2f} m {side} of the lane's centre"
     if step < len(drive.controls):
         car = viewed.world.scenario.vehicle.car()
         units = car.control_unit, *(control.unit for control in car.more_controls)
         pairs = zip(np.ravel(drive.controls[step]), units, strict=True)
-        told += f", control {', '.join(f'{u:+.3f} {unit}' for u, unit in pairs)}"
-    return told
+        text += f", control {', '.join(f'{u:+.3f} {unit}' for u, unit in pairs)}"
+    return text

@@ -106,11 +106,11 @@ def _shorten(values: np.ndarray) -> np.ndarray | None:
     if ((size > 0) & (size < 2.0**-24)).any():
         return None
     bits = (values * np.float32(_BIAS)).view(np.uint32)
-    kept = bits & np.uint32(_SIGN | _MAGNITUDE)
-    if not np.array_equal(kept.view(np.float32) * np.float32(1 / _BIAS), values):
+    masked = bits & np.uint32(_SIGN | _MAGNITUDE)
+    if not np.array_equal(masked.view(np.float32) * np.float32(1 / _BIAS), values):
         return None
-    sign = (kept >> np.uint32(16)) & np.uint32(0x8000)
-    return (sign | (kept & np.uint32(_MAGNITUDE)) >> np.uint32(13)).astype(np.uint16)
+    sign = (masked >> np.uint32(16)) & np.uint32(0x8000)
+    return (sign | (masked & np.uint32(_MAGNITUDE)) >> np.uint32(13)).astype(np.uint16)
 
 
 _PRIMES = (1, 2654435761, 805459861)

@@ -77,7 +77,7 @@ class Networks:
 
     def __init__(self, density: MLP, colour: MLP) -> None:
         self.density, self.colour = density, colour
-        self._kept: list[tuple[list[np.ndarray], list[np.ndarray]]] = []
+        self._layer_inputs: list[tuple[list[np.ndarray], list[np.ndarray]]] = []
 
     def raw_density(self, features: np.ndarray, out: np.ndarray) -> None:
         """Evaluate the raw density alone.
@@ -110,7 +110,7 @@ class Networks:
             out[part, 0], out[part, 1:] = geometry[:, 0], raw
             return first, second
 
-        self._kept = _each(work, len(features))
+        self._layer_inputs = _each(work, len(features))
 
     def backward(
         self, slope: np.ndarray, out: np.ndarray
@@ -127,7 +127,7 @@ class Networks:
         outputs = self.density.weights[-1].shape[0]
 
         def work(part: slice) -> list[np.ndarray]:
-            first, second = self._kept[part.start // BLOCK]
+            first, second = self._layer_inputs[part.start // BLOCK]
             joined, by_colour = self.colour.backward(second, slope[part, 1:])
             geometry = joined[:, :outputs]
             geometry[:, 0] += slope[part, 0]
@@ -135,22 +135,22 @@ class Networks:
             return by_density + by_colour
 
         blocks = _each(work, len(slope))
-        self._kept = []
-        total = [np.sum(parts, axis=0) for parts in zip(*blocks, strict=True)]
+        self._layer_inputs = []
+        total = [np.sum(by_block, axis=0) for by_block in zip(*blocks, strict=True)]
         split = len(self.density.weights)
         return total[:split], total[split:]
 
 
 def _each(work: Callable[[slice], Any], count: int) -> list[Any]:
     """Do work on blocks of rows, and return the results in order."""
-    parts = (slice(s, min(s + BLOCK, count)) for s in range(0, count, BLOCK))
+    slices = (slice(s, min(s + BLOCK, count)) for s in range(0, count, BLOCK))
     if not _WORKERS:
         pool = ThreadPoolExecutor(cores())
         _WORKERS.append((pool, ThreadpoolController()))
     pool, libraries = _WORKERS[0]
     # products this small are faster side by side than each on several threads
     with libraries.limit(limits=1, user_api="blas"):
-        return list(pool.map(work, parts))
+        return list(pool.map(work, slices))
 
 
 _WORKERS: list[tuple[ThreadPoolExecutor, ThreadpoolController]] = []
@@ -213,9 +213,9 @@ def add_gradients(
         by_weight: from `Networks.backward`.
     """
     nets = (field.density_net, field.colour_net)
-    for net, parts in zip(nets, by_weight, strict=True):
+    for net, gradients in zip(nets, by_weight, strict=True):
         if dr.grad_enabled(net["weights"]):
-            flat = np.concatenate([part.ravel() for part in parts])
+            flat = np.concatenate([gradient.ravel() for gradient in gradients])
             # not from NumPy memory, whose alignment would select one of two kernels
             dr.accum_grad(net["weights"], mi.Float(flat.tolist()))
 
@@ -229,9 +229,9 @@ def scatter(field: NGPField, point: mi.Point3f, slopes: mi.Float) -> None:
         slopes: (n k,), row by row.
     """
     features = [mi.Float(x) for x in field.encoding(field.clipped(point))]
-    given = columns(slopes, len(features))
-    parts = (feature * given[k] for k, feature in enumerate(features))
-    dr.backward_from(sum(parts, mi.Float(0)))
+    by_feature = columns(slopes, len(features))
+    products = (feature * by_feature[k] for k, feature in enumerate(features))
+    dr.backward_from(sum(products, mi.Float(0)))
 
 
 def _matrices(net: nn.Module) -> list[np.ndarray]:

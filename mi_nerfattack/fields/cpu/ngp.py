@@ -41,14 +41,14 @@ class PackedNGP:
         self._grid = PackedGrid(field.encoding)
         host = networks(field)
         *hidden, last = host.density.weights
-        first, *rest = host.colour.weights
+        first, *layers = host.colour.weights
         split = len(last)
         joined = first[:, :split].astype(np.float64) @ last
-        self._hidden, self._view, self._rest = hidden, first[:, split:], rest
+        self._hidden, self._view, self._layers = hidden, first[:, split:], layers
         self._joined = np.vstack([last[:1], joined]).astype(np.float32)
-        matrices = (*hidden, self._joined, self._view, *rest)
-        parts = b"".join(np.ascontiguousarray(part).tobytes() for part in matrices)
-        self.digest: str = hashlib.sha256(parts).hexdigest()
+        matrices = (*hidden, self._joined, self._view, *layers)
+        packed = b"".join(np.ascontiguousarray(part).tobytes() for part in matrices)
+        self.digest: str = hashlib.sha256(packed).hexdigest()
 
     @staticmethod
     def suits(field: NGPField) -> bool:
@@ -94,7 +94,7 @@ class PackedNGP:
         raw_density, *x = _product(self._joined, x)
         pairs = zip(x, view, strict=True)
         x = [a + b for a, b in pairs]
-        for weight in self._rest:
+        for weight in self._layers:
             x = _product(weight, _rectify(x))
         density, colour = self._field.activate(raw_density, x)
         density *= self._field.window(self._field.unit(point), active)

@@ -25,7 +25,7 @@ from mi_nerfattack.fields.bricks import (
 from mi_nerfattack.fields.ngp import NGPField
 from mi_nerfattack.fields.occupancy import Occupancy
 from mi_nerfattack.fit.pruning import dense_octants
-from mi_nerfattack.ranges import Count, Positive, Seed, Whole, checked
+from mi_nerfattack.ranges import Count, Natural, Positive, Seed, checked
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
 from mi_nerfattack.render.camera.lens import generate_rays, pose_arrays
 from mi_nerfattack.render.march import STOP
@@ -56,7 +56,7 @@ class BakeOptions:
     """
 
     cone: Positive = 1 / 64
-    passes: Whole = 4
+    passes: Natural = 4
     views: Count = 100
     seed: Seed = 0
 
@@ -110,16 +110,16 @@ def plan_bricks(
     centre = pose.apply(field.lower + (np.argwhere(cells) + 0.5) * size)
     places = np.concatenate([_places(route) for route in routes])
     distance, index = KDTree(places).query(centre[:, :2])
-    wanted = pose.scale * size.max() / (options.cone * np.maximum(distance, 1e-6))
-    subdivisions = 2 ** np.ceil(np.log2(np.clip(wanted, 1, FINEST))).astype(int)
+    divisions = pose.scale * size.max() / (options.cone * np.maximum(distance, 1e-6))
+    subdivisions = 2 ** np.ceil(np.log2(np.clip(divisions, 1, FINEST))).astype(int)
     subdivisions[octants[cells] == 0] = 1  # hardly ever looked at
     if (count := vertex_count(subdivisions)) > MOST_VERTICES:
         raise InputError(
             f"cone: {options.cone:g}; bricks would have {count} vertices, at most "
             f"{MOST_VERTICES} are possible, give a larger one"
         )
-    kept = Occupancy(cells, octants)
-    return BakePlan(kept, subdivisions.astype(np.uint8), places[index])
+    occupancy = Occupancy(cells, octants)
+    return BakePlan(occupancy, subdivisions.astype(np.uint8), places[index])
 
 
 def bake(
@@ -227,8 +227,8 @@ def _first_vertices(
         place = inner // edge**2, inner // edge % edge, inner % edge
         point = dr.gather(mi.Point3f, corner, brick)
         point += mi.Vector3f(*map(mi.Float, place)) * scale
-        seen = dr.gather(mi.Vector3f, towards, brick)
-        density, radiance = field.eval_everywhere(point, seen, mi.Bool(True))
+        direction = dr.gather(mi.Vector3f, towards, brick)
+        density, radiance = field.eval_everywhere(point, direction, mi.Bool(True))
         word = pack_word(codes.numbers(density, radiance))
         dr.scatter(words, word, dr.gather(mi.UInt32, start, brick) + inner)
         dr.eval(words)
@@ -281,9 +281,9 @@ def _add_differences(
     """Add weighted differences of the samples to four sums, weights to the fifth."""
     depth = mi.Float(0)
     while active:
-        walk, here = walk.next([posed], active)
-        active = here.active
-        depth = _add_sample(baked, posed, walk, here, heading, depth, sums)
+        walk, segment = walk.next([posed], active)
+        active = segment.active
+        depth = _add_sample(baked, posed, walk, segment, heading, depth, sums)
         active &= dr.exp(-depth) > STOP
     return depth
 
@@ -292,22 +292,24 @@ def _add_sample(
     baked: BrickField,
     posed: PosedField,
     walk: Walk,
-    here: Segment,
+    segment: Segment,
     heading: mi.Vector3f,
     depth: mi.Float,
     sums: list[mi.Float],
 ) -> mi.Float:
-    field, point = posed.field, walk.paths[0].at(here.t)
+    field, point = posed.field, walk.paths[0].at(segment.t)
     unit = field.unit(point)
-    density, radiance = field.eval_everywhere(point, heading, here.active)
-    (step,) = here.depths([posed.in_world(density * field.window(unit, here.active))])
+    density, radiance = field.eval_everywhere(point, heading, segment.active)
+    (step,) = segment.depths(
+        [posed.in_world(density * field.window(unit, segment.active))]
+    )
     weight = dr.exp(-depth) * (1 - dr.exp(-step))
-    corners = baked.corners(unit, here.active)
-    wanted = baked.codes.numbers(density, radiance)
-    found = baked.interpolate(corners, here.active)
-    changes = [a - b for a, b in zip(wanted, found, strict=True)]
+    corners = baked.corners(unit, segment.active)
+    field_numbers = baked.codes.numbers(density, radiance)
+    baked_numbers = baked.interpolate(corners, segment.active)
+    changes = [a - b for a, b in zip(field_numbers, baked_numbers, strict=True)]
     for vertex, share in corners:
         for total, change in zip(sums, [*changes, mi.Float(1)], strict=True):
             part = weight * share * change
-            dr.scatter_reduce(dr.ReduceOp.Add, total, part, vertex, here.active)
+            dr.scatter_reduce(dr.ReduceOp.Add, total, part, vertex, segment.active)
     return depth + step

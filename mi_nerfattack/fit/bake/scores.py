@@ -62,17 +62,17 @@ def score_bake(
     views: list[ViewScore] = []
     for route, arc, lateral in places:
         pose = mount_matrix(route.pose_at(arc, lateral), mount or CameraMount())[0]
-        wanted = field.render(camera, pose)
-        depth = np.where(wanted.opacity > SOLID, wanted.depth, np.inf)
+        expected = field.render(camera, pose)
+        depth = np.where(expected.opacity > SOLID, expected.depth, np.inf)
         name = f"{route.name}, {arc:.1f} m, {lateral:+.2g} m beside"
-        view = bricks.score(name, camera, pose, wanted.image, depth=depth)
+        view = bricks.score(name, camera, pose, expected.image, depth=depth)
         assert view.pictures is not None
         view = replace(
             view,
             route=route.name,
             arc_m=arc,
             lateral_m=lateral,
-            depth_median_m=_depth_difference(wanted, view.pictures.shown),
+            depth_median_m=_depth_difference(expected, view.pictures.shown),
         )
         views = keep_worst([*views, view], keep)
         progress(len(views), len(places))
@@ -84,8 +84,8 @@ def _arcs(route: Route, spacing_m: float) -> np.ndarray:
     return np.linspace(0, route.length, count, endpoint=not route.closed)
 
 
-def _depth_difference(wanted: Rendering, shown: Rendering) -> float:
-    both = (wanted.opacity >= _SURE) & (shown.opacity >= _SURE)
+def _depth_difference(expected: Rendering, shown: Rendering) -> float:
+    both = (expected.opacity >= _SURE) & (shown.opacity >= _SURE)
     if not both.any():
         return float("nan")
-    return float(np.median(np.abs(wanted.depth[both] - shown.depth[both])))
+    return float(np.median(np.abs(expected.depth[both] - shown.depth[both])))

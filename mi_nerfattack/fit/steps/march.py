@@ -44,16 +44,18 @@ class MarchStep:
         order = mi.UInt32(dr.argsort(count))
         sorted_rays = pick_rays(rays, order)
         with dr.suspend_grad():
-            found = march(self.posed, sorted_rays, STOP)
-            primal = _put_back(found, order)
+            sorted_primal = march(self.posed, sorted_rays, STOP)
+            primal = _put_back(sorted_primal, order)
         dr.eval(primal, random)
         score, cotangent = self.source.compare(draw, primal, rays.active)
-        self._backward(draw, sorted_rays, found, pick_rays(cotangent, order), order)
-        score.listed = score.kept = dr.sum(count)
+        self._backward(
+            draw, sorted_rays, sorted_primal, pick_rays(cotangent, order), order
+        )
+        score.listed = score.visible = dr.sum(count)
         return score, random
 
     def _backward(
-        self, draw: Draw, rays: Rays, found: March, cotangent: March, order: mi.UInt32
+        self, draw: Draw, rays: Rays, primal: March, cotangent: March, order: mi.UInt32
     ) -> None:
         # rays of a packet rarely meet in a vertex: adding them up first is no gain
         with dr.scoped_set_flag(dr.JitFlag.ScatterReduceLocal, False):
@@ -61,7 +63,7 @@ class MarchStep:
                 dr.ADMode.Backward,
                 self.posed,
                 rays,
-                found,
+                primal,
                 cotangent,
                 STOP,
                 with_rays=self.source.learns_poses,

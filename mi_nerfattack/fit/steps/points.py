@@ -49,19 +49,19 @@ class PointStep:
         field: the NGP, at the identity pose.
         source: of rays, and of the loss.
         listed: room for samples before visibility is known.
-        kept: room for samples that are seen.
+        visible: room for samples that are seen.
     """
 
     def __init__(
-        self, field: NGPField, source: BatchSource, listed: int, kept: int
+        self, field: NGPField, source: BatchSource, listed: int, visible: int
     ) -> None:
         self.field, self.source = field, source
         self.posed = PosedField(field)
-        self.listed, self.kept = listed, kept
+        self.listed, self.visible = listed, visible
         size = field.encoding.n_output_features
         self._raw_density = SharedRows(listed, 1)
-        self._raw = SharedRows(kept, 4)
-        self._slopes = SharedRows(kept, size)
+        self._raw = SharedRows(visible, 4)
+        self._slopes = SharedRows(visible, size)
         self._list = freeze_method(self._record_list, self._state)
         self._keep = freeze_method(self._record_keep, self._state)
         self._compare = freeze_method(self._record_compare, self._state)
@@ -77,7 +77,7 @@ class PointStep:
         samples, features, view = self._keep(
             draw.rays, listed, features, self._raw_density.array
         )
-        wide = dr.width(view) // self.kept
+        wide = dr.width(view) // self.visible
         nets.forward(rows(features, size), rows(view, wide), self._raw.view)
         score, slopes, by_window = self._compare(draw, samples, self._raw.array)
         score.listed = dr.sum(listed.count)
@@ -103,12 +103,12 @@ class PointStep:
         with dr.suspend_grad():
             depths = self.field.activate(raw, [raw, raw, raw])[0] * listed.width
             dr.eval(depths)
-            samples, slots = keep_visible(listed, depths, STOP, self.kept)
+            samples, slots = keep_visible(listed, depths, STOP, self.visible)
             heading = mi.Vector3f(
                 *(dr.gather(mi.Float, x, samples.ray) for x in rays.direction)
             )
             view = lay_out(dr.sh_eval(heading, self.field.sh_order))
-            shape = (self.field.encoding.n_output_features, self.kept)
+            shape = (self.field.encoding.n_output_features, self.visible)
             rows = dr.gather(mi.ArrayXf, features, slots, shape=shape)
             return samples, lay_out(rows), view
 
@@ -126,7 +126,7 @@ class PointStep:
             primal = composite(samples, values, colours)
             dr.eval(primal)
         score, cotangent = self.source.compare(draw, primal, samples.fits)
-        score.kept = dr.sum(samples.count)
+        score.visible = dr.sum(samples.count)
         with dr.suspend_grad():
             spread = self._spread(samples, values)
             by_depth, by_colour = cotangents(
@@ -160,10 +160,11 @@ class PointStep:
             there = dr.detach(factor)
             dr.backward_from(factor * dr.select(there > 0, by_window / there, 0))
             by_point = dr.select(self._is_used(samples), dr.grad(point), 0)
-            self.source.backward_rays(draw, *_along_rays(draw.rays, samples, by_point))
+            by_origin, by_direction = _along_rays(draw.rays, samples, by_point)
+            self.source.backward_rays(draw, by_origin, by_direction)
 
     def _is_used(self, samples: Samples) -> mi.Bool:
-        return dr.arange(mi.UInt32, self.kept) < dr.sum(samples.count)
+        return dr.arange(mi.UInt32, self.visible) < dr.sum(samples.count)
 
 
 @dr.syntax

@@ -108,27 +108,27 @@ def _fill(posed: PosedField, rays: Rays, samples: Samples) -> None:
     walk = Walk.start(posed, rays)[0]
     active = slot < end
     while active:
-        walk, here = walk.next([posed], active)
-        dr.scatter(samples.ray, ray, slot, here.active)
-        dr.scatter(samples.t, here.t, slot, here.active)
-        unit = posed.field.unit(walk.paths[0].at(here.t))
-        width = here.width * posed.field.window(unit, here.active)
-        dr.scatter(samples.width, width, slot, here.active)
+        walk, segment = walk.next([posed], active)
+        dr.scatter(samples.ray, ray, slot, segment.active)
+        dr.scatter(samples.t, segment.t, slot, segment.active)
+        unit = posed.field.unit(walk.paths[0].at(segment.t))
+        width = segment.width * posed.field.window(unit, segment.active)
+        dr.scatter(samples.width, width, slot, segment.active)
         slot += 1
-        active = here.active & (slot < end)
+        active = segment.active & (slot < end)
 
 
 @dr.syntax
 def _visible(samples: Samples, depths: mi.Float, stop: float) -> mi.UInt32:
     slot, end = mi.UInt32(samples.first), samples.first + samples.count
-    tau, kept = mi.Float(0), mi.UInt32(0)
+    tau, count = mi.Float(0), mi.UInt32(0)
     active = slot < end
     while active:
         tau += dr.gather(mi.Float, depths, slot, active)
-        kept += 1
+        count += 1
         slot += 1
         active &= (slot < end) & (dr.exp(-tau) > stop)
-    return kept
+    return count
 
 
 @dr.syntax
@@ -202,8 +202,8 @@ class Spread:
             moment: sum of weight times position before it.
         """
         behind = self.weight - before - weight
-        rest = self.moment - moment - weight * position
-        distance = position * (before - behind) - (moment - rest)
+        moment_behind = self.moment - moment - weight * position
+        distance = position * (before - behind) - (moment - moment_behind)
         return 2 * distance + (2 / 3) * weight * self.width
 
 
@@ -250,8 +250,8 @@ def cotangents(
 
     With ``w_k`` the weight of a sample, ``T_k+1`` the transmittance behind it and
     ``g_k`` the objective's derivative by the weight:
-    ``dJ/dx_k = T_k+1 g_k - sum_{j>k} w_j g_j``. This computes :class:`Rest` with one
-    sum, of ``w_j g_j``, instead of one sum for each part of a march.
+    ``dJ/dx_k = T_k+1 g_k - sum_{j>k} w_j g_j``. This computes :class:`Remainder` with
+    one sum, of ``w_j g_j``, instead of one sum for each part of a march.
 
     Args:
         samples: n rays, m slots.
@@ -269,7 +269,7 @@ def cotangents(
     by_colour = dr.zeros(mi.Color3f, count)
     dr.make_opaque(by_depth, by_colour)
     # sum of w_j g_j still to come; the penalty is of second degree in the weights
-    rest = cotangent.pair(primal) + 2 * spread.factor * spread.penalty
+    sum_behind = cotangent.pair(primal) + 2 * spread.factor * spread.penalty
     before, moment = mi.Float(0), mi.Float(0)
     slot, end = mi.UInt32(samples.first), samples.first + samples.count
     tau = mi.Float(0)
@@ -287,8 +287,8 @@ def cotangents(
         )
         before += weight
         moment += weight * s
-        rest -= weight * g
-        dr.scatter(by_depth, dr.exp(-tau - x) * g - rest, slot, active)
+        sum_behind -= weight * g
+        dr.scatter(by_depth, dr.exp(-tau - x) * g - sum_behind, slot, active)
         for c in dr.hint(range(3), mode="scalar"):
             dr.scatter(by_colour[c], weight * cotangent.radiance[c], slot, active)
         tau += x

@@ -69,22 +69,22 @@ class PolicyClient:
         self, url: str, token: str = "", timeout_s: float = 10.0, retries: int = 2
     ) -> None:
         try:
-            parts = urllib.parse.urlsplit(url)
-            usable = parts.scheme in ("http", "https") and parts.port != 0
+            address = urllib.parse.urlsplit(url)
+            usable = address.scheme in ("http", "https") and address.port != 0
             usable = usable and url.isascii() and url.isprintable() and " " not in url
-            (parts.hostname or "").encode("idna")  # raises where a label is too long
+            (address.hostname or "").encode("idna")  # raises where a label is too long
         except ValueError as err:
             raise InputError(f"policy.url: {url!r}: {err}") from err
-        if parts.username is not None or parts.password is not None:
+        if address.username is not None or address.password is not None:
             raise InputError(
                 "policy.url: has a name or password, which logs show; give a token"
             )
-        if not usable or not parts.hostname:
+        if not usable or not address.hostname:
             raise InputError(f"policy.url: {url!r}; must be http://HOST... or https://")
         self.url, self.timeout_s, self.retries = url, timeout_s, retries
-        self._path = parts.path or "/"
-        if parts.query:
-            self._path += f"?{parts.query}"
+        self._path = address.path or "/"
+        if address.query:
+            self._path += f"?{address.query}"
         self._headers = {
             "Content-Type": "application/x-npy",
             "X-Client": secrets.token_hex(8),
@@ -92,11 +92,11 @@ class PolicyClient:
         if token:
             self._headers["Authorization"] = f"Bearer {token}"
         self._tls: ssl.SSLContext | None = None
-        self._http = http.client.HTTPConnection(parts.hostname, parts.port or 80)
-        if parts.scheme == "https":
+        self._http = http.client.HTTPConnection(address.hostname, address.port or 80)
+        if address.scheme == "https":
             self._tls = ssl.create_default_context()
             self._http = http.client.HTTPSConnection(
-                parts.hostname, parts.port or 443, context=self._tls
+                address.hostname, address.port or 443, context=self._tls
             )
         self._socket: socket.socket | None = None  # the newest
         self._lock = threading.Lock()
@@ -207,9 +207,9 @@ class PolicyClient:
         """Connect to the first address of the host that answers."""
         host, port = self._http.host, self._http.port
         problem = OSError(f"{host} has no address")
-        for found in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+        for entry in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
             try:
-                sock = socket.create_connection((str(found[4][0]), port), _left(end))
+                sock = socket.create_connection((str(entry[4][0]), port), _left(end))
             except OSError as err:
                 problem = err
                 continue

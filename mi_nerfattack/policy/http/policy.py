@@ -45,9 +45,9 @@ class HttpPolicy(AbstractBlackBox):
         )
 
     def answer(
-        self, given: Mapping[str, np.ndarray], goals: np.ndarray, step: int
+        self, arrays: Mapping[str, np.ndarray], goals: np.ndarray, step: int
     ) -> np.ndarray:
         """Ask the server."""
-        columns = [given[name].reshape(len(goals), -1) for name in self.sent]
+        columns = [arrays[name].reshape(len(goals), -1) for name in self.sent]
         numbers = np.hstack(columns) if columns else None
-        return self.client.ask(given[IMAGE], goals.tolist(), step, numbers)
+        return self.client.ask(arrays[IMAGE], goals.tolist(), step, numbers)

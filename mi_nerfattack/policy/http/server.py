@@ -33,7 +33,7 @@ MAX_CLIENTS = 16  # whose memories are kept
 MAX_THREADS = 100  # of the process; further connections are closed
 IDLE_S = 30.0  # after which a silent connection ends
 _DRAIN_S = 5.0
-_KEPT = 100_000  # times of answers
+_MAX_TIMES = 100_000  # times of answers
 #: Header of the .npy format, version 1, as NumPy writes it for (n, 3, height, width).
 _NPY = re.compile(
     rb"\x93NUMPY\x01\x00..\{'descr': '(<f4|\|u1)', 'fortran_order': False, "
@@ -87,7 +87,7 @@ class PolicyServer(HttpServer):
         self._policy, self._token = policy, token.encode()
         self._deciding, self._counting = threading.Lock(), threading.Lock()
         self._drives: dict[str, _Drive] = {}
-        self._seconds: deque[float] = deque(maxlen=_KEPT)
+        self._seconds: deque[float] = deque(maxlen=_MAX_TIMES)
         self._decisions = self._strangers = 0
 
     def process_request(self, request: Any, client_address: Any) -> None:
@@ -99,8 +99,8 @@ class PolicyServer(HttpServer):
 
     def admit(self, authorization: str) -> None:
         """Refuse a client without the token."""
-        given = authorization.removeprefix("Bearer ").encode("utf-8", "replace")
-        if self._token and not hmac.compare_digest(given, self._token):
+        token = authorization.removeprefix("Bearer ").encode("utf-8", "replace")
+        if self._token and not hmac.compare_digest(token, self._token):
             with self._counting:
                 self._strangers += 1
             raise RefusedError(401, "the token is wrong or missing")

@@ -56,8 +56,8 @@ class Call:
         value = self.get(index)
         if value is not None:
             return [int(v) for v in value.flatten().tolist()]
-        found = self.attributes.get(name)
-        return None if found is None else [int(v) for v in found]
+        attribute = self.attributes.get(name)
+        return None if attribute is None else [int(v) for v in attribute]
 
     def number(self, index: int, name: str) -> float | None:
         """Return a number from an input or, in older versions, an attribute."""

@@ -97,16 +97,16 @@ def argument(call: Call) -> torch.Tensor:
     """ArgMax and ArgMin: the first of equal ones."""
     call.only("select_last_index", 0)
     axis, keeps = call.attribute("axis", 0), bool(call.attribute("keepdims", 1))
-    found = torch.argmax if call.operator == "ArgMax" else torch.argmin
-    return found(call.x, axis, keeps)
+    search = torch.argmax if call.operator == "ArgMax" else torch.argmin
+    return search(call.x, axis, keeps)
 
 
 def top(call: Call) -> tuple[torch.Tensor, ...]:
     """TopK: values, and their indices."""
     (count,) = call.integers(1, "k") or [1]
     axis, largest = call.attribute("axis", -1), bool(call.attribute("largest", 1))
-    found = call.x.topk(count, axis, largest, bool(call.attribute("sorted", 1)))
-    return found.values, found.indices
+    selection = call.x.topk(count, axis, largest, bool(call.attribute("sorted", 1)))
+    return selection.values, selection.indices
 
 
 def non_zero(call: Call) -> torch.Tensor:

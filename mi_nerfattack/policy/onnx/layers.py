@@ -46,21 +46,24 @@ def convolve_transposed(call: Call) -> torch.Tensor:
     axes, sizes = weight.ndim - 2, call.x.shape[2:]
     strides = list(call.attribute("strides", [1] * axes))
     dilations = list(call.attribute("dilations", [1] * axes))
-    more = list(call.attribute("output_padding", [0] * axes))
+    output_padding = list(call.attribute("output_padding", [0] * axes))
     group = call.attribute("group", 1)
-    whole = _TRANSPOSED[axes](call.x, weight, None, strides, 0, 0, group, dilations)
+    uncropped = _TRANSPOSED[axes](call.x, weight, None, strides, 0, 0, group, dilations)
     pads = list(call.attribute("pads", [0] * 2 * axes))
-    rule, wanted = call.attribute("auto_pad", "NOTSET"), call.attribute("output_shape")
-    if wanted is None and rule.startswith("SAME"):
-        wanted = [size * stride for size, stride in zip(sizes, strides, strict=True)]
-    for i, size in enumerate(wanted or ()):
-        total = whole.shape[2 + i] + more[i] - size
+    rule = call.attribute("auto_pad", "NOTSET")
+    output_shape = call.attribute("output_shape")
+    if output_shape is None and rule.startswith("SAME"):
+        output_shape = [
+            size * stride for size, stride in zip(sizes, strides, strict=True)
+        ]
+    for i, size in enumerate(output_shape or ()):
+        total = uncropped.shape[2 + i] + output_padding[i] - size
         before = total // 2 if rule == "SAME_UPPER" else total - total // 2
         pads[i], pads[i + axes] = before, total - before
     flat = []
     for i in reversed(range(axes)):
-        flat += [-pads[i], more[i] - pads[i + axes]]
-    result = functional.pad(whole, flat)
+        flat += [-pads[i], output_padding[i] - pads[i + axes]]
+    result = functional.pad(uncropped, flat)
     return result if bias is None else result + bias.reshape(-1, *[1] * axes)
 
 

@@ -105,7 +105,7 @@ class Input:
     """
 
     name: str
-    whole: bool
+    is_integer: bool
     sizes: tuple[int | None, ...]
 
 
@@ -128,12 +128,12 @@ class OnnxNetwork(torch.nn.Module):
         self.rounds = rounds
         self.opset: int = _opset(model, name)
         graph = model.graph
-        self.whole: dict[str, torch.Tensor] = {}
+        self.integers: dict[str, torch.Tensor] = {}
         self.floating: dict[str, str] = {}
         nodes = [_node(node, name) for node in graph.node]
         self._read_constants(graph, nodes)
         self.nodes: list[Node] = [node for node in nodes if node.operator != "Constant"]
-        known = {*self.whole, *self.floating}
+        known = {*self.integers, *self.floating}
         self.inputs: list[Input] = [
             _input(i) for i in graph.input if i.name not in known
         ]
@@ -165,14 +165,16 @@ class OnnxNetwork(torch.nn.Module):
                 f"{list(controls)}: give the name of the control there, or those of "
                 f"several; policy.recurrent declares {hidden} hidden states"
             )
-        rest = [other for other in names if other not in controls] if hidden else []
-        if len(rest) != hidden:
+        hidden_names = (
+            [other for other in names if other not in controls] if hidden else []
+        )
+        if len(hidden_names) != hidden:
             raise InputError(
                 f"{self.name}: has the outputs {listed}; beside the controls "
                 f"{list(controls)} there must be {hidden} hidden states, as "
                 "policy.recurrent declares"
             )
-        self.outputs, self.controls = [*controls, *rest], len(controls)
+        self.outputs, self.controls = [*controls, *hidden_names], len(controls)
 
     def forward(self, *arguments: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Evaluate all nodes; the first time of these sizes, by a budget of memory."""
@@ -187,26 +189,26 @@ class OnnxNetwork(torch.nn.Module):
     def _run(self, arguments: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, ...]:
         dtype = next((b.dtype for b in self.buffers()), arguments[0].dtype)
         device = arguments[0].device
-        values: dict[str, torch.Tensor] = dict(self.whole)
+        values: dict[str, torch.Tensor] = dict(self.integers)
         for name, buffer in self.floating.items():
             values[name] = self.get_buffer(buffer)
         values.update(self._bound(arguments, dtype))
         for node in self.nodes:
-            given = [values[name] if name else None for name in node.inputs]
+            inputs = [values[name] if name else None for name in node.inputs]
             call = Call(
-                node.operator, given, node.attributes, self.opset, dtype, device
+                node.operator, inputs, node.attributes, self.opset, dtype, device
             )
             result = self._evaluate(node, call)
             results = result if isinstance(result, tuple) else (result,)
             for name, value in zip(node.outputs, results, strict=False):
                 values[name] = value
-        found = [values[name] for name in self.outputs]
+        outputs = [values[name] for name in self.outputs]
         if self.controls > 1:
             columns = [
-                value.reshape(len(value), -1) for value in found[: self.controls]
+                value.reshape(len(value), -1) for value in outputs[: self.controls]
             ]
-            found[: self.controls] = [torch.cat(columns, 1)]
-        return tuple(found)
+            outputs[: self.controls] = [torch.cat(columns, 1)]
+        return tuple(outputs)
 
     def _evaluate(self, node: Node, call: Call) -> Any:
         try:
@@ -251,7 +253,7 @@ class OnnxNetwork(torch.nn.Module):
         self, item: Input, value: torch.Tensor, dtype: torch.dtype
     ) -> torch.Tensor:
         """Return an argument in the type of its input."""
-        if not item.whole:
+        if not item.is_integer:
             return value.to(dtype)
         if self.rounds and value.is_floating_point():
             value = value.to(dtype)
@@ -274,7 +276,7 @@ class OnnxNetwork(torch.nn.Module):
                 self.floating[name] = f"constant_{len(self.floating)}"
                 self.register_buffer(self.floating[name], value.to(dtype))
             else:
-                self.whole[name] = value
+                self.integers[name] = value
 
 
 def load_onnx(path: Path, rounds: bool = False) -> OnnxNetwork:
@@ -309,7 +311,7 @@ def load_onnx(path: Path, rounds: bool = False) -> OnnxNetwork:
             "inside: onnx.save(onnx.load(FILE), FILE)"
         )
     network = OnnxNetwork(model, str(path), rounds)
-    if network.inputs[0].whole and not rounds:
+    if network.inputs[0].is_integer and not rounds:
         raise InputError(
             f"{path}: input {network.inputs[0].name!r}, the image, is of integers, "
             "which have no derivative; export the network with a float input, and "
@@ -368,7 +370,9 @@ def _tensor(tensor: Any, owner: str) -> torch.Tensor:
     try:
         array = np.array(to_array(tensor))
         if array.dtype.kind in "iub":
-            return torch.from_numpy(array.astype(_WHOLE.get(array.dtype, array.dtype)))
+            return torch.from_numpy(
+                array.astype(_INTEGER_TYPES.get(array.dtype, array.dtype))
+            )
         double = array.dtype == np.float64
         return torch.from_numpy(array.astype(np.float64 if double else np.float32))
     except (KeyError, TypeError, ValueError) as err:
@@ -377,7 +381,7 @@ def _tensor(tensor: Any, owner: str) -> torch.Tensor:
 
 
 #: Types that torch lacks or hardly computes with.
-_WHOLE = {np.dtype(f"uint{bits}"): np.int64 for bits in (16, 32, 64)}
+_INTEGER_TYPES = {np.dtype(f"uint{bits}"): np.int64 for bits in (16, 32, 64)}
 
 
 def _input(value: Any) -> Input:

@@ -135,8 +135,8 @@ class Openpilot(torch.nn.Module):
             the history with these features.
         """
         pictures = road, wide
-        seen = [pictures[_IMAGES[item.name]] for item in self.vision.inputs]
-        feature = _cut("features", self.features, self.vision, *seen)
+        images = [pictures[_IMAGES[item.name]] for item in self.vision.inputs]
+        feature = _cut("features", self.features, self.vision, *images)
         known = torch.cat([history, feature[:, None]], 1)
         inputs = self._policy_inputs(known[:, :: self.stride], speed)
         plan = _cut("plan", self.plan, self.policy, *inputs)

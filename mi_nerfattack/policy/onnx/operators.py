@@ -19,7 +19,7 @@ from mi_nerfattack.policy.onnx.layers import LAYERS
 from mi_nerfattack.policy.onnx.recurrent import RECURRENT
 
 #: Element types of ONNX that stay integers or booleans; floating ones become one type.
-_WHOLE_TYPES = {
+_INTEGER_TYPES = {
     2: torch.uint8,
     3: torch.int8,
     5: torch.int16,
@@ -49,8 +49,8 @@ def _many(
 
 def _divide(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Divide; integers towards zero."""
-    whole = not (a.is_floating_point() or b.is_floating_point())
-    return torch.div(a, b, rounding_mode="trunc") if whole else a / b
+    are_integers = not (a.is_floating_point() or b.is_floating_point())
+    return torch.div(a, b, rounding_mode="trunc") if are_integers else a / b
 
 
 def gemm(call: Call) -> torch.Tensor:
@@ -99,14 +99,14 @@ def modulo(call: Call) -> torch.Tensor:
 
 def einsum(call: Call) -> torch.Tensor:
     """Einsum."""
-    parts = [call.need(i) for i in range(len(call.inputs))]
-    return torch.einsum(call.attribute("equation"), *parts)
+    operands = [call.need(i) for i in range(len(call.inputs))]
+    return torch.einsum(call.attribute("equation"), *operands)
 
 
 def mean(call: Call) -> torch.Tensor:
     """Mean of any number of inputs."""
-    parts = [call.need(i) for i in range(len(call.inputs))]
-    return reduce(torch.add, parts) / len(parts)
+    inputs = [call.need(i) for i in range(len(call.inputs))]
+    return reduce(torch.add, inputs) / len(inputs)
 
 
 def gelu(call: Call) -> torch.Tensor:
@@ -119,9 +119,9 @@ def cast(call: Call) -> torch.Tensor:
     target = call.attribute("to")
     if target in _FLOATING_TYPES:
         return call.x.to(call.dtype)
-    if target not in _WHOLE_TYPES:
+    if target not in _INTEGER_TYPES:
         raise InputError(f"Cast: to element type {target} is not supported")
-    return call.x.to(_WHOLE_TYPES[target])
+    return call.x.to(_INTEGER_TYPES[target])
 
 
 def cast_like(call: Call) -> torch.Tensor:
@@ -181,8 +181,8 @@ def transpose(call: Call) -> torch.Tensor:
 
 def concat(call: Call) -> torch.Tensor:
     """Concat."""
-    parts = [call.need(i) for i in range(len(call.inputs))]
-    return torch.cat(parts, call.attribute("axis"))
+    inputs = [call.need(i) for i in range(len(call.inputs))]
+    return torch.cat(inputs, call.attribute("axis"))
 
 
 def split(call: Call) -> tuple[torch.Tensor, ...]:

@@ -92,13 +92,13 @@ def _layer(
             x.new_zeros(x.shape[1], size) if start is None else start[i]
             for start in (call.get(5), call.get(6))[:states]
         )
-        seen = []
+        hidden = []
         for step in reversed(projected) if backward else projected:
             state = cell(step, call.need(2)[i], within, *state)
-            seen.append(state[0])
-        outputs.append(torch.stack(seen[::-1] if backward else seen))
+            hidden.append(state[0])
+        outputs.append(torch.stack(hidden[::-1] if backward else hidden))
         lasts.append(state)
-    last = (torch.stack(parts) for parts in zip(*lasts, strict=True))
+    last = (torch.stack(by_direction) for by_direction in zip(*lasts, strict=True))
     return torch.stack(outputs, dim=1), *last
 
 

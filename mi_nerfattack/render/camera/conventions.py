@@ -223,8 +223,8 @@ def from_mitsuba(sensor: mi.Sensor) -> tuple[Camera, np.ndarray]:
             _number(params[key]) if key in params else 0.0
             for key in ("principal_point_offset_x", "principal_point_offset_y")
         ]
-        centre = (0.5 - shift[0]) * width, (0.5 - shift[1]) * height
-        camera = Camera(width, height, focal, focal, *centre)
+        cx, cy = (0.5 - shift[0]) * width, (0.5 - shift[1]) * height
+        camera = Camera(width, height, fx=focal, fy=focal, cx=cx, cy=cy)
     else:
         raise InputError(
             f"sensor {sensor.id()!r}: {sensor.class_name()}; only perspective, "

@@ -101,8 +101,8 @@ def unbend(radius: Any, k1: Any, k2: Any, k3: Any, k4: Any) -> Any:
     """Invert `bend` by a fixed number of Newton steps from the radius."""
     angle = radius
     for _ in range(_NEWTON_STEPS):
-        found, slope = bend(angle, k1, k2, k3, k4)
-        angle = angle - (found - radius) / slope
+        bent, slope = bend(angle, k1, k2, k3, k4)
+        angle = angle - (bent - radius) / slope
     return angle
 
 

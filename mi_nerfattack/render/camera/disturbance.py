@@ -19,7 +19,7 @@ import drjit as dr
 import numpy as np
 
 from mi_nerfattack.backend.arrays import concat, split, vjp
-from mi_nerfattack.ranges import NonNegative, Whole, checked
+from mi_nerfattack.ranges import Natural, NonNegative, checked
 from mi_nerfattack.render.camera.rig import Layout, camera_seed
 
 #: Standard deviations at which the blur's kernel ends.
@@ -53,8 +53,8 @@ class Disturbance:
     exposure_ev_sd: NonNegative = 0.0
     blur_px_sd: NonNegative = 0.0
     noise_sd: NonNegative = 0.0
-    seed: Whole = 0
-    first: Whole = 0
+    seed: Natural = 0
+    first: Natural = 0
     colour_ev_sd: NonNegative = 0.0
 
     def __bool__(self) -> bool:
@@ -139,11 +139,11 @@ def disturbed(
         a tensor like it; differentiable.
     """
     if layout is not None and len(layout.sizes) > 1:
-        parts = []
+        images = []
         for k, part in enumerate(layout.split(image)):
             own = camera_seed(seed, k)
-            parts.append(disturbed(part, exposures, blurs, noise_sd, own, step, first))
-        return side_by_side(parts, layout)
+            images.append(disturbed(part, exposures, blurs, noise_sd, own, step, first))
+        return side_by_side(images, layout)
     kind, shape, value = type(image.array), image.shape, image.array
     if exposures.any() or blurs.any():
         # Lens and shutter act on linear light

@@ -248,8 +248,8 @@ class CameraMount:
         So a camera that looks ahead from the middle is described as it was before
         mounts had these two numbers, and what was made with it keeps its identity.
         """
-        found = dict(vars(self))
-        return {k: v for k, v in found.items() if v or k not in ("left_m", "yaw_deg")}
+        numbers = dict(vars(self))
+        return {k: v for k, v in numbers.items() if v or k not in ("left_m", "yaw_deg")}
 
 
 def mount_matrix(states: np.ndarray, mount: CameraMount) -> np.ndarray:

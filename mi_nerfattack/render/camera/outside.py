@@ -64,8 +64,8 @@ class Overhead:
     def camera(self) -> Camera:
         """Intrinsics."""
         focal = self.height_m / self.metres_per_px
-        middle = self.width / 2, self.height / 2
-        return Camera(self.width, self.height, focal, focal, *middle)
+        cx, cy = self.width / 2, self.height / 2
+        return Camera(self.width, self.height, fx=focal, fy=focal, cx=cx, cy=cy)
 
     @property
     def mount(self) -> CameraMount:

@@ -84,12 +84,12 @@ class Pose:
 
     def is_near(self, other: Pose) -> bool:
         """Tell whether two poses are equal to about single precision."""
-        parts = zip(
+        pairs = zip(
             (self.rotation, self.translation, self.scale),
             (other.rotation, other.translation, other.scale),
             strict=True,
         )
-        return all(np.allclose(a, b, rtol=1e-6, atol=1e-6) for a, b in parts)
+        return all(np.allclose(a, b, rtol=1e-6, atol=1e-6) for a, b in pairs)
 
     def moved(self, offset: np.ndarray) -> Pose:
         """Return the pose moved by an offset.

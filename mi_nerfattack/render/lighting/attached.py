@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.composite import AbstractComposite, Seen
+from mi_nerfattack.render.composite import AbstractComposite, Marches
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
 
@@ -72,24 +72,24 @@ class _Render(dr.CustomOp):
     ) -> tuple[mi.Color3f, mi.Float]:
         del sources
         self.composite, self.fixed, self.stop = composite, (posed, rays), stop
-        self.seen = composite.render(posed, rays, stop)
-        return self.seen.total.radiance, self.seen.total.opacity
+        self.primal = composite.render(posed, rays, stop)
+        return self.primal.total.radiance, self.primal.total.opacity
 
     def forward(self) -> None:
         if any(item.has_pose_gradients for item in self.fixed[0]):
             raise InputError(
                 "to_world: has no derivative in forward mode; use dr.backward"
             )
-        tangent = self.composite.forward(*self.fixed, self.seen, self.stop)
+        tangent = self.composite.forward(*self.fixed, self.primal, self.stop)
         self.set_grad_out((tangent.total.radiance, tangent.total.opacity))
 
     def backward(self) -> None:
         total: Any = self.grad_out()
         radiance, opacity = total
-        cotangent = Seen(March(radiance, opacity, mi.Float(0)))
+        cotangent = Marches(March(radiance, opacity, mi.Float(0)))
         posed, rays = self.fixed
-        found = self.composite.backward_rays(
-            posed, rays, self.seen, cotangent, self.stop, range(len(posed))
+        gradients = self.composite.backward_rays(
+            posed, rays, self.primal, cotangent, self.stop, range(len(posed))
         )
-        for item, by_rays in zip(posed, found, strict=True):
+        for item, by_rays in zip(posed, gradients, strict=True):
             item.backward_pose(rays, by_rays)

@@ -54,8 +54,8 @@ def dome(count: int = _DOME) -> np.ndarray:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
 
 
-def _add(*parts: tuple[np.ndarray, np.ndarray]) -> Light:
-    towards, strength = zip(*parts, strict=True)
+def _add(*sources: tuple[np.ndarray, np.ndarray]) -> Light:
+    towards, strength = zip(*sources, strict=True)
     return Light(np.concatenate(towards), np.concatenate(strength))
 
 
@@ -154,7 +154,7 @@ class Sunlight:
         Args:
             rotation: (3, 3), from the frame of the directions to the world.
         """
-        towards, (direct, sky, ground) = dome(), self._parts
+        towards, (direct, sky, ground) = dome(), self._radiances
         is_sky = towards @ rotation[2] > 0  # the world's z
         radiance = np.where(is_sky, sky, ground)
         diffuse = np.repeat(radiance[:, None] * 4 / len(towards), 3, axis=1)
@@ -163,10 +163,10 @@ class Sunlight:
 
     def emitters(self) -> dict[str, Any]:
         """Describe the same as an `envmap` and, if it shines, a `directional` sun."""
-        direct, sky, ground = self._parts
+        direct, sky, ground = self._radiances
         image = np.full((64, 128, 3), sky, np.float32)
         image[32:] = ground
-        found: dict[str, Any] = {
+        emitters: dict[str, Any] = {
             "dome": {
                 "type": "envmap",
                 "bitmap": mi.Bitmap(image),
@@ -175,26 +175,26 @@ class Sunlight:
         }
         if direct > 0:
             irradiance = np.pi * direct * black_body(self.colour_k)
-            found["sun"] = {
+            emitters["sun"] = {
                 "type": "directional",
                 "direction": (-self._sun).tolist(),
                 "irradiance": {"type": "rgb", "value": irradiance.tolist()},
             }
-        return found
+        return emitters
 
     @property
     def _sun(self) -> np.ndarray:
         return sun_direction(self.elevation_deg, self.azimuth_deg)
 
     @property
-    def _parts(self) -> tuple[float, float, float]:
+    def _radiances(self) -> tuple[float, float, float]:
         """Return a sun's `Light.strength`, and the radiances of sky and ground."""
         height = float(self._sun[2])
         # Of a sky of radiance 1, a surface that faces the sun sees (1 + height) / 2
         direct = self.share / (1 - self.share) * (1 + height) / 2
         ground = _ALBEDO * (1 + direct * height)
-        whole = direct + (1 + height) / 2 + ground * (1 - height) / 2
-        return direct / whole, 1 / whole, ground / whole
+        luminance = direct + (1 + height) / 2 + ground * (1 - height) / 2
+        return direct / luminance, 1 / luminance, ground / luminance
 
 
 def black_body(temperature_k: float) -> np.ndarray:

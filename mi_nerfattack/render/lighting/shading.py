@@ -126,9 +126,9 @@ class LightMaps(AbstractLightMaps):
         known = surface.known & (before.min(1) > _DARK)
         now = surface.spread(surface.irradiance(light))
         factors = now / np.where(known, before.T, 1).T
-        found = np.ones((len(factors), 4), np.float32)
-        found[:, :3] = factors[_nearest(known, self.shape)]
-        return found
+        padded = np.ones((len(factors), 4), np.float32)
+        padded[:, :3] = factors[_nearest(known, self.shape)]
+        return padded
 
 
 def light_maps(field: AbstractField) -> LightMaps:
@@ -173,8 +173,8 @@ class _Surface:
         lower, upper = source.lower, source.upper
         cells = np.array(counts) - 1
         edge = float(((upper - lower) / cells).max())
-        found = [_look(shape, view, edge) for view in views]
-        point, normal = (np.concatenate(part) for part in zip(*found, strict=True))
+        samples = [_look(shape, view, edge) for view in views]
+        point, normal = (np.concatenate(part) for part in zip(*samples, strict=True))
         if not len(point):
             raise InputError(
                 f"sun: the {source.kind} is nowhere opaque, so that it has no surface "
@@ -260,9 +260,9 @@ def _look(
     rays = Rays(_point(origin), mi.Vector3f(*map(float, -view)))
     dr.make_opaque(rays)
     opacity = march(shape, rays, STOP).opacity.numpy()
-    found = expected_surface(shape, rays, STOP)
-    kept = opacity > _OPAQUE
-    return found.point.numpy().T[kept], found.normal.numpy().T[kept]
+    surface = expected_surface(shape, rays, STOP)
+    opaque = opacity > _OPAQUE
+    return surface.point.numpy().T[opaque], surface.normal.numpy().T[opaque]
 
 
 def _point(values: np.ndarray) -> mi.Point3f:
@@ -282,12 +282,12 @@ def _corners(
     cell = place.astype(int)
     inside = place - cell
     nx, ny, _ = counts
-    found = []
+    corners = []
     for corner in product((0, 1), repeat=3):
         x, y, z = (cell + corner).T
         weight = np.where(corner, inside, 1 - inside).prod(1)
-        found.append(((z * ny + y) * nx + x, weight))
-    return found
+        corners.append(((z * ny + y) * nx + x, weight))
+    return corners
 
 
 def _nearest(known: np.ndarray, counts: tuple[int, ...]) -> np.ndarray:
@@ -298,7 +298,7 @@ def _nearest(known: np.ndarray, counts: tuple[int, ...]) -> np.ndarray:
     from scipy import ndimage  # slow to import
 
     grid = ~known.reshape(counts[::-1])
-    found: Any = ndimage.distance_transform_edt(
+    nearest: Any = ndimage.distance_transform_edt(
         grid, return_distances=False, return_indices=True
     )
-    return np.ravel_multi_index(list(found), grid.shape).ravel()
+    return np.ravel_multi_index(list(nearest), grid.shape).ravel()

@@ -85,9 +85,16 @@ def expected_surface(shape: PosedField, rays: Rays, stop: float) -> Surface:
         rate = dr.select(active, 1 / primal.opacity, 0)
         depth = dr.select(active, primal.moment * rate, 0)
         by_depth = March(mi.Color3f(0), -depth * rate, rate)
-        mode = dr.ADMode.Backward
-        fixed = shape, rays, primal, by_depth, stop
-        slope = march_derivative(mode, *fixed, with_rays=True)[1].origin
+        _, by_rays = march_derivative(
+            dr.ADMode.Backward,
+            shape,
+            rays,
+            primal=primal,
+            cotangent=by_depth,
+            stop=stop,
+            with_rays=True,
+        )
+        slope = by_rays.origin
         slope += rate * _entry_slope(shape, rays, depth, active)
         length = dr.norm(slope)
         clear = (length > 0) & (length < dr.inf) & (primal.opacity > FAINT)

@@ -131,8 +131,10 @@ class FrameRenderer:
         if not 0 <= seed < _MAX_SEED:
             raise InputError(f"seed: {seed}; must be in [0, 2^32)")
         pose = self._own_pose() if camera_to_world is None else camera_to_world
-        about = self._lens, pose, seed, self._spp * self._passes, self._digests
-        return frame_metadata(*about, **self._origin)
+        spp, digests = self._spp * self._passes, self._digests
+        return frame_metadata(
+            self._lens, pose, seed, spp=spp, digests=digests, **self._origin
+        )
 
     def render(self, camera_to_world: np.ndarray | None = None, seed: int = 0) -> Frame:
         """Render one frame.
@@ -174,10 +176,10 @@ class FrameRenderer:
         """Return samples per pixel of a pass, and the number of passes."""
         width, height = self.size_px
         sampler: Any = self.sensor.sampler()
-        wanted = sampler.sample_count() if spp is None else spp
-        passes = max(1, math.ceil(wanted * width * height / _MAX_RAYS))
-        passes = min(passes, wanted)
-        sampler.set_sample_count(math.ceil(wanted / passes))
+        samples = sampler.sample_count() if spp is None else spp
+        passes = max(1, math.ceil(samples * width * height / _MAX_RAYS))
+        passes = min(passes, samples)
+        sampler.set_sample_count(math.ceil(samples / passes))
         return int(sampler.sample_count()), passes
 
     def _move(self, camera_to_world: np.ndarray) -> None:

@@ -60,7 +60,7 @@ def ground_findings(
         )
         yield (
             f"route {route.name!r} has no ground beneath it in {name} "
-            f"{stretches(arc, missing)}: it runs there from {_told(points[missing])}, "
+            f"{stretches(arc, missing)}: it runs there from {_ends(points[missing])}, "
             f"and the scene's surfaces lie within x {low[0]:.4g} to {high[0]:.4g}, y "
             f"{low[1]:.4g} to {high[1]:.4g}, z {low[2]:.4g} to {high[2]:.4g} m; scale, "
             "turn or move routes or scene (metres, z up)"
@@ -113,12 +113,12 @@ def _ground(scene: Any, route: Route, arc: np.ndarray) -> np.ndarray:
         points = route.pose_at(arc, side * route.lane_width_m)[:, :2]
         below = _BONNET_M - vertical_reach(scene, points, _BONNET_M)
         above = _BONNET_M + vertical_reach(scene, points, _BONNET_M, up=True)
-        found = np.where(np.isfinite(below), below, above)
-        sides.append(np.where(np.isfinite(found), found, np.nan))
+        height = np.where(np.isfinite(below), below, above)
+        sides.append(np.where(np.isfinite(height), height, np.nan))
     right, left = sides
     return np.where(np.abs(right) < np.abs(left), left, right) + 0 * left
 
 
-def _told(points: np.ndarray) -> str:
+def _ends(points: np.ndarray) -> str:
     (x, y), (u, v) = points[0].round(1) + 0, points[-1].round(1) + 0
     return f"({x:g}, {y:g}) to ({u:g}, {v:g}) m"

@@ -211,8 +211,8 @@ def named_files(
         InputError: the XML cannot be read.
     """
     with _resolved_from(path):
-        given = dict(parameters or {})
-        state = _parsed(path, given)
+        definitions = dict(parameters or {})
+        state = _parsed(path, definitions)
         texts = [Path(str(name)).resolve() for name in state.files]
         names = [
             node.props[key]
@@ -221,9 +221,9 @@ def named_files(
             if isinstance(node.props[key], str)
         ]
         # the parser replaces a spectrum's file by its numbers
-        names += _spectra([files.read_text(text) for text in texts], given)
+        names += _spectra([files.read_text(text) for text in texts], definitions)
         resolver = mi.file_resolver()  # pyright: ignore[reportCallIssue]
-        found = {
+        paths = {
             name: resolve(name)
             if name.startswith(BUNDLED)
             else Path(str(resolver.resolve(name)))
@@ -231,7 +231,7 @@ def named_files(
             if name
         }
     included = {f"included {k}": text for k, text in enumerate(texts[1:])}
-    there = {k: file.resolve() for k, file in found.items() if os.path.isfile(file)}
+    there = {k: file.resolve() for k, file in paths.items() if os.path.isfile(file)}
     return included | there
 
 
@@ -277,19 +277,19 @@ class _Attributes(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        found = {name: value or "" for name, value in attrs}
-        if tag == "default" and "name" in found:
-            self.defaults[found["name"]] = found.get("value", "")
-        elif "filename" in found:
-            self.filenames.append(found["filename"])
+        attributes = {name: value or "" for name, value in attrs}
+        if tag == "default" and "name" in attributes:
+            self.defaults[attributes["name"]] = attributes.get("value", "")
+        elif "filename" in attributes:
+            self.filenames.append(attributes["filename"])
 
 
 def _spectra(texts: list[str], parameters: Mapping[str, str]) -> list[str]:
     """Return the file names of spectra in XML texts."""
-    parts = [_Attributes(text) for text in texts]
-    values = {k: v for part in parts for k, v in part.defaults.items()}
+    attributes = [_Attributes(text) for text in texts]
+    values = {k: v for part in attributes for k, v in part.defaults.items()}
     values |= parameters
-    names = [name for part in parts for name in part.filenames]
+    names = [name for part in attributes for name in part.filenames]
     for _ in range(len(values)):  # a default may name others
         names = [
             _PARAMETER.sub(lambda match: values.get(match[1], match[0]), name)
@@ -373,15 +373,15 @@ def _refuse_empty_bitmaps(path: str | Path, state: Any) -> None:
 
 def _refuse_devices(path: Path) -> None:
     """Refuse pipes and devices, which Mitsuba would wait for, before it opens any."""
-    left, seen = [path], {path}
+    left, visited = [path], {path}
     while left:
         source = left.pop()
         for name in _VALUE.findall(files.read_text(source)):
             file = source.parent / name
             if os.path.isfile(file):
-                if file.suffix.lower() == ".xml" and file not in seen:
+                if file.suffix.lower() == ".xml" and file not in visited:
                     left.append(file)
-                    seen.add(file)
+                    visited.add(file)
             elif os.path.exists(file) and not os.path.isdir(file):
                 raise InputError(f"{source}: {name!r} is a pipe or a device; copy it")
 

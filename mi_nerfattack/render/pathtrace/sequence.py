@@ -137,24 +137,24 @@ def _render(
     files.check_writable(paths[0])
     for i, (path, pose) in enumerate(zip(paths, shot.camera_to_world, strict=True)):
         seed = (shot.seed + i) % 2**32
-        kept = path.is_file() and not shot.anew
-        more = {"precision": shot.precision}
-        if kept:
-            check_same(path, shot.renderer.metadata(pose, seed) | more)
+        skipped = path.is_file() and not shot.anew
+        precision = {"precision": shot.precision}
+        if skipped:
+            check_same(path, shot.renderer.metadata(pose, seed) | precision)
         else:
             frame = select(shot.renderer.render(pose, seed))
-            told = replace(frame, metadata={**frame.metadata, **more})
-            write_frame(path, told, shot.precision)
-        progress(i + 1, total, kept)
+            labelled = replace(frame, metadata={**frame.metadata, **precision})
+            write_frame(path, labelled, shot.precision)
+        progress(i + 1, total, skipped)
     return paths
 
 
 def check_same(path: str | Path, expected: dict[str, str]) -> None:
     """Raise InputError if an EXR file was not rendered from what `expected` says."""
     present = exr.read_metadata(path)
-    kept = {key: present[key] for key in _COMPARED if key in present}
-    found = differences(kept, {key: expected[key] for key in _COMPARED})
-    refuse(path, found, "render all anew (--force), or to another folder")
+    compared = {key: present[key] for key in _COMPARED if key in present}
+    issues = differences(compared, {key: expected[key] for key in _COMPARED})
+    refuse(path, issues, "render all anew (--force), or to another folder")
 
 
 def _read_srgb(paths: list[Path]) -> Iterator[np.ndarray]:

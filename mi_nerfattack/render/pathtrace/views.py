@@ -47,7 +47,7 @@ def frame_metadata(
     seed: int,
     spp: int | None,
     digests: Mapping[str, str],
-    **more: Any,
+    **details: Any,
 ) -> dict[str, str]:
     """Describe a frame: where it was seen from, and what it was made of.
 
@@ -57,17 +57,17 @@ def frame_metadata(
         seed: of what is random in it.
         spp: samples per pixel; None where the frame is not made of samples.
         digests: SHA-256 of what it shows, by name.
-        more: whatever else is known, as JSON can say it, e.g. ``time_s=0.4``; None is
-            left out.
+        details: whatever else is known, as JSON can say it, e.g. ``time_s=0.4``; None
+            is left out.
 
     Returns:
         by name, as JSON, or unchanged where a value is text: ``camera`` with its
         ``to_world``, ``pose_convention``, ``seed``, ``spp``, ``variant``, ``versions``,
-        ``digests`` and `more`.
+        ``digests`` and `details`.
     """
     # nine digits tell all 32-bit numbers apart; no -0
     rows = [[float(f"{value + 0:.9g}") for value in row] for row in camera_to_world]
-    found = {
+    metadata = {
         "camera": {**lens, "to_world": rows},
         "pose_convention": POSE_CONVENTION,
         "seed": seed,
@@ -75,11 +75,11 @@ def frame_metadata(
         "variant": mi.variant(),
         "versions": versions(),
         "digests": dict(sorted(digests.items())),
-        **more,
+        **details,
     }
     return {
         name: value if isinstance(value, str) else json.dumps(value)
-        for name, value in found.items()
+        for name, value in metadata.items()
         if value is not None
     }
 

@@ -125,8 +125,8 @@ class SplatBackground(AbstractBackdrop):
 
     def state(self) -> list[Any]:
         """See ``AbstractBackdrop.state``."""
-        seen = [self._columns, self._packed, self._opacities]
-        return [self, *self._shapes.arrays(), *seen]
+        arrays = [self._columns, self._packed, self._opacities]
+        return [self, *self._shapes.arrays(), *arrays]
 
     def march(self, rays: Rays, stop: float) -> March:
         """See ``AbstractBackdrop.march``; evaluated when it returns."""
@@ -136,8 +136,8 @@ class SplatBackground(AbstractBackdrop):
                 return March.zeros(dr.width(rays.direction))
             shades = self._shade(lists.near, lists.near.ahead)
             dr.eval(shades)
-            found = blend(by_cell(rays, where, lists), lists, shades, stop)
-            result = put_rays(found, where.order, dr.width(where.order))
+            blended = blend(by_cell(rays, where, lists), lists, shades, stop)
+            result = put_rays(blended, where.order, dr.width(where.order))
             dr.eval(result)
             return result
 

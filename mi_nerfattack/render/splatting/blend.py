@@ -71,11 +71,11 @@ def blend(rays: Lines, lists: Lists, shades: mi.Float, stop: float) -> March:
     moment = mi.Float(0)
     passed = mi.Float(1)  # transmittance so far
     while active:
-        window, hit, seen = _next(rays, lists, shades, window, place, active)
-        shade = dr.gather(mi.Vector4f, shades, hit.index, seen)
+        window, hit, is_hit = _next(rays, lists, shades, window, place, active)
+        shade = dr.gather(mi.Vector4f, shades, hit.index, is_hit)
         weight = passed * hit.opacity
         display += weight * mi.Color3f(shade.xyz)
-        moment += dr.select(seen, weight * hit.peak, 0)
+        moment += dr.select(is_hit, weight * hit.peak, 0)
         passed -= weight
         place += 1
         active &= (place < rays.end + WINDOW) & (passed > stop)
@@ -110,17 +110,17 @@ def replay(
     window, place, active = _start(rays)
     tangent, by_origin, by_direction = March(), mi.Vector3f(0), mi.Vector3f(0)
     while active:
-        window, hit, seen = _next(rays, lists, shades, window, place, active)
+        window, hit, is_hit = _next(rays, lists, shades, window, place, active)
         with dr.resume_grad():
             # The splat again, attached to its shade and to the ray
             origin, direction = mi.Vector3f(rays.origin), mi.Vector3f(rays.direction)
             if dr.hint(with_rays, mode="scalar"):
                 dr.enable_grad(origin, direction)
-            shade = dr.gather(mi.Vector4f, shades, hit.index, seen)
-            peak, opacity, _ = _meet(origin, direction, lists, shade, hit.index, seen)
+            shade = dr.gather(mi.Vector4f, shades, hit.index, is_hit)
+            peak, opacity, _ = _meet(origin, direction, lists, shade, hit.index, is_hit)
             # dI/dc = w, dI/da = T c less what is behind
             colour = mi.Color3f(shade.xyz)
-            weight, depth = passed * hit.opacity, dr.select(seen, hit.peak, 0)
+            weight, depth = passed * hit.opacity, dr.select(is_hit, hit.peak, 0)
             display -= weight * dr.detach(colour)
             moment -= weight * depth
             behind = dr.rcp(1 - hit.opacity)
@@ -133,12 +133,12 @@ def replay(
             )
             # From the splat to the parameters and the ray, or the other way
             if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
-                dr.backward_from(dr.select(seen, by_sums.pair(change), 0))
+                dr.backward_from(dr.select(is_hit, by_sums.pair(change), 0))
             else:
-                tangent = tangent.plus(dr.forward_to(change), seen)
+                tangent = tangent.plus(dr.forward_to(change), is_hit)
             if dr.hint(with_rays, mode="scalar"):
-                by_origin += dr.select(seen, dr.grad(origin), 0)
-                by_direction += dr.select(seen, dr.grad(direction), 0)
+                by_origin += dr.select(is_hit, dr.grad(origin), 0)
+                by_direction += dr.select(is_hit, dr.grad(direction), 0)
         passed -= weight
         place += 1
         active &= (place < rays.end + WINDOW) & (passed > stop)
@@ -214,15 +214,15 @@ def _slide(window: list[_Hit], new: _Hit) -> tuple[list[_Hit], _Hit]:
 
 def _develop(sums: March) -> March:
     """Return the march of sums whose radiance is premultiplied sRGB."""
-    seen = sums.opacity > 0
-    colour = dr.srgb_to_linear(sums.radiance / dr.select(seen, sums.opacity, 1))
+    visible = sums.opacity > 0
+    colour = dr.srgb_to_linear(sums.radiance / dr.select(visible, sums.opacity, 1))
     return March(sums.opacity * colour, sums.opacity, sums.moment)
 
 
 def _sums_of(primal: March, cotangent: March) -> tuple[March, March]:
     """Undo :func:`_develop`, for a march and for its cotangent."""
-    seen = primal.opacity > 0
-    colour = primal.radiance / dr.select(seen, primal.opacity, 1)
+    visible = primal.opacity > 0
+    colour = primal.radiance / dr.select(visible, primal.opacity, 1)
     display = primal.opacity * dr.linear_to_srgb(colour)
     sums = March(display, mi.Float(primal.opacity), mi.Float(primal.moment))
     with dr.resume_grad():

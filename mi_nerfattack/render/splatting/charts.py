@@ -143,8 +143,8 @@ def _origins(origin: mi.Point3f, count: int) -> tuple[mi.Point3f, mi.UInt32, mi.
     if dr.width(starts) <= ORIGINS:
         view = dr.cumsum(dr.select(changes, mi.UInt32(1), mi.UInt32(0)))
         return dr.gather(mi.Point3f, origin, starts), view, none
-    whole = dr.rcp(dr.opaque(mi.Float, count))
-    middle = mi.Point3f(*(dr.sum(x) * whole for x in origin))
+    weight = dr.rcp(dr.opaque(mi.Float, count))
+    middle = mi.Point3f(*(dr.sum(x) * weight for x in origin))
     return middle, dr.zeros(mi.UInt32, count), dr.max(dr.norm(origin - middle))
 
 

@@ -128,11 +128,11 @@ def _visible(shapes: Shapes, charts: Charts) -> mi.UInt32:
     _, _, own, ball = _take_apart(shapes, charts, lane)
     x, y, z = own.local(ball.xyz - own.origin)
     reach = ball.w + own.spread
-    seen = (own.rays > 0) & (z > -reach)
+    visible = (own.rays > 0) & (z > -reach)
     for place, low, high in zip((x, y), own.low, own.high, strict=True):
-        seen &= place - low * z > -reach * dr.sqrt(1 + low * low)
-        seen &= high * z - place > -reach * dr.sqrt(1 + high * high)
-    return dr.compress(seen)
+        visible &= place - low * z > -reach * dr.sqrt(1 + low * low)
+        visible &= high * z - place > -reach * dr.sqrt(1 + high * high)
+    return dr.compress(visible)
 
 
 def _take_apart(
@@ -169,20 +169,20 @@ def _extent(own: Charts, ahead: mi.Vector3f, axes: list[mi.Vector3f]) -> _Extent
     turned = [a.x * axes[0] + a.y * axes[1] + a.z * axes[2] for a in own.axes]
     # A ball around each point contains those that rays start from
     grown = dr.select(own.spread > 0, mi.Float(2), mi.Float(1))
-    more = 2 * dr.square(own.spread)
-    deep = grown * dr.squared_norm(turned[2]) + more
+    padding = 2 * dr.square(own.spread)
+    deep = grown * dr.squared_norm(turned[2]) + padding
     room = dr.square(z) - deep
     is_ahead = (z > 0) & (room > 1e-4 * dr.square(z))
-    seen = (z > 0) | (room < 0)
+    visible = (z > 0) | (room < 0)
     begin, counts = [], []
     for k, place in enumerate((x, y)):
         low, high = own.low[k], own.high[k]
-        wide = grown * dr.squared_norm(turned[k]) + more
+        wide = grown * dr.squared_norm(turned[k]) + padding
         mixed = grown * dr.dot(turned[k], turned[2])
         for sign, edge in ((1, low), (-1, high)):
             beyond = wide - 2 * edge * mixed + dr.square(edge) * deep
             reach = dr.sqrt(dr.maximum(beyond, 0))
-            seen &= sign * (place - edge * z) > -reach
+            visible &= sign * (place - edge * z) > -reach
         root = wide * dr.square(z) - 2 * mixed * place * z + deep * dr.square(place)
         root = dr.sqrt(dr.maximum(root + dr.square(mixed) - wide * deep, 0))
         middle = place * z - mixed
@@ -192,7 +192,7 @@ def _extent(own: Charts, ahead: mi.Vector3f, axes: list[mi.Vector3f]) -> _Extent
         last = dr.minimum(mi.UInt32((far - low) / own.size), own.counts[k] - 1)
         begin.append(dr.minimum(mi.UInt32((near - low) / own.size), last))
         counts.append(last - begin[k] + 1)
-    return _Extent(begin, counts[0], dr.select(seen, counts[0] * counts[1], 0))
+    return _Extent(begin, counts[0], dr.select(visible, counts[0] * counts[1], 0))
 
 
 def _expand(extent: _Extent) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
@@ -248,8 +248,8 @@ def _order(
     shift, steps = dr.opaque(mi.UInt32, bits), dr.opaque(mi.Float, 2.0**bits - 1)
     depth = dr.log2(dr.maximum(peak, _NEAREST) / _NEAREST) / _OCTAVES
     key = (cell << shift) | mi.UInt32(dr.minimum(depth, 0.999999) * steps)
-    kept = dr.compress(meets)
-    key, owner = (dr.gather(mi.UInt32, value, kept) for value in (key, owner))
+    index = dr.compress(meets)
+    key, owner = (dr.gather(mi.UInt32, value, index) for value in (key, owner))
     dr.eval(key, owner)
     return key, owner, shift
 
@@ -264,10 +264,10 @@ def upload_fours(rows: np.ndarray) -> mi.Float:
 def gather_fours(values: mi.Float, index: mi.UInt32, count: int, *mask: Any) -> list:
     """Return `count` numbers of each row of :func:`upload_fours`, (n,) each."""
     size = -(-count // 4)
-    parts = [
+    fours = [
         dr.gather(mi.Vector4f, values, size * index + k, *mask) for k in range(size)
     ]
-    return [value for part in parts for value in part][:count]
+    return [value for four in fours for value in four][:count]
 
 
 def lay_out_fours(values: list[mi.Float]) -> mi.Float:

@@ -130,14 +130,14 @@ def judge_routes(comparison: Comparison) -> list[Criterion]:
 
 def _judged(route: RouteComparison) -> list[Criterion]:
     """Judge one route; where noise alone is wrong, the advice is less of it."""
-    found = judge(route.stations, subject=ROUTE, depth_m=route.depth_median_m)
+    criteria = judge(route.stations, subject=ROUTE, depth_m=route.depth_median_m)
     error, noise = (
         10 ** (-0.1 * route.mean(name)) for name in ("psnr_db", "ceiling_db")
     )
     is_noise = error - noise <= 10 ** (-0.1 * MIN_PSNR_DB)
-    if is_noise and [item.figure for item in found if not item.met] == ["psnr_db"]:
-        found = [replace(item, advice=_NOISY) for item in found]
-    return found
+    if is_noise and [item.figure for item in criteria if not item.met] == ["psnr_db"]:
+        criteria = [replace(item, advice=_NOISY) for item in criteria]
+    return criteria
 
 
 def settings_line(comparison: Comparison) -> str:

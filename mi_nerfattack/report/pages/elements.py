@@ -131,7 +131,14 @@ def make_pane(
         if shown.size != size:
             shown = shown.resize(size, Image.Resampling.LANCZOS)
         sheet.paste(shown, (0, size[1] * number))
-    return Pane(title, alt, address(sheet, quality=SHEET_QUALITY), *size, tuple(labels))
+    return Pane(
+        title,
+        alt,
+        address(sheet, quality=SHEET_QUALITY),
+        width=size[0],
+        height=size[1],
+        labels=tuple(labels),
+    )
 
 
 _HTML = Environment(
@@ -148,7 +155,7 @@ _HTML.filters["embedded"] = _embedded
 #: Cases that stand beside each other.
 SHOWN_CASES = (NO_OBJECT, RANDOM, ATTACK)
 #: Sections of a page that have pictures of each run, with what the folder may lack.
-ABOVE, COST, SEEN, TEXTURES, WHEN = "above", "cost", "seen", "textures", "when"
+ABOVE, COST, FRAMES, TEXTURES, WHEN = "above", "cost", "seen", "textures", "when"
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +236,7 @@ class RetrainPart:
 
 
 @dataclass(frozen=True, eq=False)
-class Parts:
+class PageContents:
     """All that a page shows.
 
     Attributes:

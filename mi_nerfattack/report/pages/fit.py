@@ -82,9 +82,9 @@ def write_fit_report(
         "good_enough": all(item.met for item in criteria),
         "settings": result.field.metadata(),
     }
-    about, depth = "Of the worst views", "depth of the field"
+    caption, depth = "Of the worst views", "depth of the field"
     if any(view.pictures and view.pictures.depth is None for view in worst):
-        about += "; there is no depth to compare with"
+        caption += "; there is no depth to compare with"
     else:
         depth += ", depth that was given, and their difference"
     sections = {
@@ -94,8 +94,8 @@ def write_fit_report(
             Picture("image, field, and their difference", root / "worst.png")
         ],
         "Depth": [
-            f"{about}. Grey: the field stops less than half of the light, or no depth "
-            "is known.",
+            f"{caption}. Grey: the field stops less than half of the light, or no "
+            "depth is known.",
             Picture(depth, root / "depth.png"),
         ],
         "The fit": [Picture("loss and PSNR, single and averaged", root / "curve.png")],
@@ -228,5 +228,5 @@ def _unit(result: FitResult) -> str:
 
 
 def _duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest} s" if minutes else f"{seconds:.1f} s"
+    minutes, remainder = divmod(round(seconds), 60)
+    return f"{minutes} min {remainder} s" if minutes else f"{seconds:.1f} s"

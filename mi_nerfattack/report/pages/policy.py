@@ -75,7 +75,7 @@ _NOT_MEASURED = (
 
 def write_policy_page(
     folder: Path,
-    about: Mapping[str, Any],
+    evaluation: Mapping[str, Any],
     record: TrainingRecord | None,
     card: Mapping[str, Any],
     drives: NamedDrives,
@@ -84,7 +84,7 @@ def write_policy_page(
 
     Args:
         folder: an existing folder; NAME is the name of the policy's file.
-        about: of the evaluation, JSON: `policy`, `command`, `settings`,
+        evaluation: what it is of, JSON: `policy`, `command`, `settings`,
             `environments`, `versions`, `seconds_a_drive` and more.
         record: of the policy's training; None without a record.
         card: {ENVIRONMENT: {ROUTE: {CASE: figures}}}.
@@ -93,10 +93,10 @@ def write_policy_page(
     Returns:
         The Markdown file.
     """
-    name = policy_name(str(about["policy"]))
+    name = policy_name(str(evaluation["policy"]))
     document = {
         "schema": SCHEMA,
-        **about,
+        **evaluation,
         "machine": machine(),
         "environments": card,
         "training": None if record is None else training_facts(record),

@@ -12,7 +12,12 @@ from matplotlib.colors import to_hex
 from mi_nerfattack.io import files
 from mi_nerfattack.report import table
 from mi_nerfattack.report.columns import Cell, Column, Table
-from mi_nerfattack.report.pages.elements import Parts, RunPart, TransferPart, render
+from mi_nerfattack.report.pages.elements import (
+    PageContents,
+    RunPart,
+    TransferPart,
+    render,
+)
 from mi_nerfattack.report.plots.transfer import COLOURS, LIGHT, Line, matrix_lines
 
 _COST_LABELS: Mapping[str, str] = {
@@ -26,15 +31,15 @@ _COST_LABELS: Mapping[str, str] = {
 }
 
 
-def write_results_page(path: str | Path, title: str, parts: Parts) -> None:
+def write_results_page(path: str | Path, title: str, contents: PageContents) -> None:
     """Write a self-contained HTML page, atomically.
 
     Args:
         path: HTML file.
         title: of the page.
-        parts: what it shows.
+        contents: what it shows.
     """
-    shown = parts.shown
+    shown = contents.shown
     cost: list[dict[str, Any]] = [
         {
             _COST_LABELS.get(key, key): value
@@ -45,7 +50,7 @@ def write_results_page(path: str | Path, title: str, parts: Parts) -> None:
     text = render(
         "results.html.j2",
         title=title,
-        parts=parts,
+        contents=contents,
         shown=shown,
         tables=table,
         matrix=_matrix,
@@ -76,8 +81,8 @@ def _matrix(part: TransferPart) -> Table:
     def cell(line: Line, condition: str) -> Cell:
         if condition not in line.cells:
             return Cell("")
-        value, told = line.cells[condition]
-        text, _, out = told.partition("\n")
+        value, label = line.cells[condition]
+        text, _, out = label.partition("\n")
         share = value / most
         colour = "#000" if share > LIGHT else "#fff"
         style = f"background: {to_hex(colours(share))}; color: {colour}"

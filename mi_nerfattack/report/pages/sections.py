@@ -67,10 +67,10 @@ def markdown(title: str, lead: str, sections: Sections) -> str:
         lead: below the title.
         sections: content by title.
     """
-    parts = [f"# {_escaped(title)}", _escaped(lead)]
+    paragraphs = [f"# {_escaped(title)}", _escaped(lead)]
     for name, blocks in sections.items():
-        parts += [f"## {_escaped(name)}", *map(_as_markdown, blocks)]
-    return "\n\n".join(parts) + "\n"
+        paragraphs += [f"## {_escaped(name)}", *map(_as_markdown, blocks)]
+    return "\n\n".join(paragraphs) + "\n"
 
 
 def code(value: str) -> Markup:

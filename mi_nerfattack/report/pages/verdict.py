@@ -67,18 +67,18 @@ SCENE = Subject(
     learnt="The field has learnt images, not the scene: add images between the "
     "present ones, refine the poses, or take a smaller network.",
 )
-_MORE = "Capture more views where the frames are worst, and fit for longer."
+_RECAPTURE = "Capture more views where the frames are worst, and fit for longer."
 ROUTE = Subject(
     use=SCENE.use,
     views="frames",
     reach="with the driving camera along the routes. This decides, and not the "
     "held-out views of the fit, because a policy sees these frames.",
     few="Take frames nearer to each other (--every-m).",
-    blurred=_MORE,
-    worst=_MORE,
+    blurred=_RECAPTURE,
+    worst=_RECAPTURE,
     fog=SCENE.fog,
-    holes=_MORE,
-    depth=_MORE,
+    holes=_RECAPTURE,
+    depth=_RECAPTURE,
 )
 OBJECT = Subject(
     use="as an object to attack",
@@ -149,12 +149,14 @@ def judge(
         subject: words for the kind of field.
         depth_m: median error of the depth near the camera, metres; NaN if unknown.
     """
-    found: list[Criterion] = []
+    criteria: list[Criterion] = []
 
     def add(
         figure: str, name: str, value: float, limit: float, at_least: bool, advice: str
     ) -> None:
-        found.append(Criterion(figure, name, value, limit, at_least, advice, subject))
+        criteria.append(
+            Criterion(figure, name, value, limit, at_least, advice, subject)
+        )
 
     psnr, worst = mean(scores, "psnr_db"), least(scores, "psnr_db")
     add("views", subject.views, len(scores), MIN_VIEWS, True, subject.few)
@@ -175,7 +177,7 @@ def judge(
         gap = 0.0 if pooled == fitted_db else fitted_db - pooled  # both may be infinite
         name = "PSNR of fitted rays less that of held-out ones (dB)"
         add("gap_db", name, gap, MAX_GAP_DB, False, subject.learnt)
-    return found
+    return criteria
 
 
 def verdict(criteria: Sequence[Criterion]) -> str:

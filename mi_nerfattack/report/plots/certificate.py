@@ -34,7 +34,9 @@ def plot_robustness(path: str | Path, document: Mapping[str, Any]) -> None:
         axis.plot(along, bound, color=BLUE, label=f"bound, {100 * confidence:g} %")
         axis.fill_between(along, bound, 1, color=BLUE, alpha=0.08, linewidth=0)
         axis.errorbar(
-            *([0, *radii], chances, errors),
+            [0, *radii],
+            chances,
+            errors,
             fmt="o",
             color=ORANGE,
             capsize=3,
@@ -78,8 +80,14 @@ def plot_gradient(path: str | Path, document: Mapping[str, Any]) -> None:
         left.legend(frameon=False)
         last = document["rows"][-1]
         right.plot(last["predicted"], last["real"], "o", color=BLUE, markersize=3)
-        along = [last["along_predicted"]], [last["along_real"]]
-        right.plot(*along, "*", color=ORANGE, markersize=9, label="along the gradient")
+        right.plot(
+            [last["along_predicted"]],
+            [last["along_real"]],
+            "*",
+            color=ORANGE,
+            markersize=9,
+            label="along the gradient",
+        )
         right.axline((0, 0), slope=1, color=GREY, linewidth=0.8)
         right.set_xlabel("predicted change of the objective")
         right.set_ylabel("real change")

@@ -58,8 +58,8 @@ def convergence(
             style = {"color": ORANGE, "marker": marker, "markersize": 3}
             axis.plot(at, values, label="of an iteration", **style)
             if curve is not None:
-                best = curve["frames"], curve[name]
-                axis.step(*best, where="post", color=BLUE, label="best so far")
+                frames, best = curve["frames"], curve[name]
+                axis.step(frames, best, where="post", color=BLUE, label="best so far")
             axis.set_ylabel(label)
             axis.grid(alpha=0.25)
             axis.xaxis.get_major_locator().set_params(integer=True)
@@ -128,9 +128,9 @@ def _draw(axis: Axes, curves: Curves, label: str, color: str, style: str) -> Non
     look = {"color": color, "linewidth": 1.6, "linestyle": style, "label": label}
     axis.step(frames, np.median(table, axis=0), where="post", **look)
     if len(curves) > 1:
-        ends = table.min(axis=0), table.max(axis=0)
+        low, high = table.min(axis=0), table.max(axis=0)
         band = {"step": "post", "facecolor": color, "alpha": 0.18, "linewidth": 0}
-        axis.fill_between(frames, *ends, **band)
+        axis.fill_between(frames, low, high, **band)
 
 
 def _held(curve: Mapping[str, Sequence[float]], frames: np.ndarray) -> np.ndarray:
@@ -157,7 +157,7 @@ def against_limit(
         axis = figure.subplots()
         for number, (name, points) in enumerate(environments.items()):
             at = sorted({x for x, _ in points})
-            groups = [[y for x, y in points if x == here] for here in at]
+            groups = [[y for x, y in points if x == position] for position in at]
             middle = np.array([np.median(group) for group in groups])
             ends = np.array([(min(group), max(group)) for group in groups]).T
             bars = np.abs(ends - middle)

@@ -55,24 +55,26 @@ def write_curve(
 
 
 def write_cameras_above(
-    path: str | Path, found: Structure, flagged: AbstractSet[str]
+    path: str | Path, structure: Structure, flagged: AbstractSet[str]
 ) -> None:
     """Draw the path of cameras, where they look, and sparse points, from above.
 
     Args:
         path: PNG file.
-        found: with z up.
+        structure: with z up.
         flagged: names of images to take again.
     """
-    eyes = found.camera_to_world[:, :3, 3]
-    ahead = found.camera_to_world[:, :3, 2]
+    eyes = structure.camera_to_world[:, :3, 3]
+    ahead = structure.camera_to_world[:, :3, 2]
     reach = 0.04 * max(float(np.ptp(eyes[:, :2], axis=0).max()), 1e-9)
-    bad = np.array([name in flagged for name in found.names])
+    bad = np.array([name in flagged for name in structure.names])
     with chart(path, 5.0) as figure:
         axes = figure.subplots()
-        low, high = np.percentile(np.concatenate([found.points, eyes]), [2, 98], axis=0)
-        inside = ((found.points >= low) & (found.points <= high)).all(1)
-        axes.scatter(*found.points[inside, :2].T, s=0.4, color=GREY, alpha=0.4)
+        low, high = np.percentile(
+            np.concatenate([structure.points, eyes]), [2, 98], axis=0
+        )
+        inside = ((structure.points >= low) & (structure.points <= high)).all(1)
+        axes.scatter(*structure.points[inside, :2].T, s=0.4, color=GREY, alpha=0.4)
         axes.plot(*eyes[:, :2].T, color=BLUE, linewidth=0.8, alpha=0.6)
         for mask, colour, label in (
             (~bad, BLUE, f"cameras ({(~bad).sum()})"),

@@ -135,9 +135,11 @@ def side_views(
     views = []
     for name, look, (heat, _) in zip(SIDES, around.views(grid), heats, strict=True):
         opacity = look[1]
-        seen = opacity > VISIBLE
-        shown = heat[..., 0] / np.where(seen, opacity, 1) * largest
-        views.append(SideView(name, over_paper(*look), np.where(seen, shown, np.nan)))
+        visible = opacity > VISIBLE
+        shown = heat[..., 0] / np.where(visible, opacity, 1) * largest
+        views.append(
+            SideView(name, over_paper(*look), np.where(visible, shown, np.nan))
+        )
     return views
 
 

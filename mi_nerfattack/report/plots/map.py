@@ -27,7 +27,7 @@ from mi_nerfattack.vehicle.route.route import Route
 
 OBJECT = "#F0C000"
 _LANE, _EDGE, _CENTRE = "#ececec", "#b5b5b5", "#9a9a9a"
-_PARTS = 240  # of a route
+_SAMPLES = 240  # of a route
 
 #: Left, right, bottom and top on the ground, metres.
 Extent = tuple[float, float, float, float]
@@ -139,7 +139,7 @@ def _axes(count: int, extent: Extent) -> tuple[Figure, Any]:
 
 def lane_lines(route: Route) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the centre, the left and the right border of a lane, (n, 2) each."""
-    x, y, theta = route.pose_at(np.linspace(0, route.length, _PARTS)).T
+    x, y, theta = route.pose_at(np.linspace(0, route.length, _SAMPLES)).T
     centre, half = np.stack([x, y], axis=1), route.lane_width_m / 2
     offset = half * np.stack([-np.sin(theta), np.cos(theta)], axis=1)
     return centre, centre + offset, centre - offset

@@ -36,9 +36,9 @@ from mi_nerfattack.vehicle.route.route import Route
 
 WIDTH_PX = 1600
 CENTRE, START, END, CAMERA = "#00E5FF", "#00C853", "#FF1744", "#FF6D00"
-_PARTS, _ARROWS = 240, 7  # of a drive's line
+_SAMPLES, _ARROWS = 240, 7  # of a drive's line
 _REAR, _FRONT = 0.5, 1.9  # of a car's middle rear axle, in widths
-_TOLD = {"REFUSED": "#B00020", "LOOK AT": "#9A5B00"}
+_SENTENCE_COLOURS = {"REFUSED": "#B00020", "LOOK AT": "#9A5B00"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ def place_picture(
     overhead: Overhead,
     grounds: Mapping[str, np.ndarray],
     looks: Mapping[str, Look] | None = None,
-    told: Sequence[str] = (),
+    sentences: Sequence[str] = (),
     title: str = "",
 ) -> None:
     """Write the picture of a place as PNG.
@@ -107,7 +107,7 @@ def place_picture(
         overhead: camera of all grounds.
         grounds: rendered pictures from above by title.
         looks: pictures through cameras by title.
-        told: sentences below the pictures.
+        sentences: below the pictures.
         title: above all.
     """
     looks = looks or {}
@@ -115,7 +115,7 @@ def place_picture(
     width_in = WIDTH_PX / DPI
     lines = [
         (line, text)
-        for text in told
+        for text in sentences
         for line in textwrap.wrap(text, 150, subsequent_indent="    ")
     ]
     aspect = (top - bottom) / (right - left)
@@ -143,9 +143,9 @@ def place_picture(
                 _draw_look(axis, overlay, name, look)
         if lines:
             for k, (line, text) in enumerate(lines):
-                colour = _TOLD.get(text.partition(":")[0], "black")
-                at = 0.01, 1 - (k + 0.5) / len(lines)
-                rows[-1, 0].text(*at, line, va="center", color=colour)
+                colour = _SENTENCE_COLOURS.get(text.partition(":")[0], "black")
+                y = 1 - (k + 0.5) / len(lines)
+                rows[-1, 0].text(0.01, y, line, va="center", color=colour)
         save(path, figure)
 
 
@@ -192,8 +192,7 @@ def _draw_legend(figure: Any, axis: Any) -> None:
     """Name each kind of thing that a map shows once."""
     labels = dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
     style = {"ncols": 5, "frameon": False, "columnspacing": 1.2}
-    names = labels.values(), labels.keys()
-    figure.legend(*names, loc="center", fontsize=8, **style)
+    figure.legend(labels.values(), labels.keys(), loc="center", fontsize=8, **style)
 
 
 def _draw_ground(
@@ -232,10 +231,10 @@ def _draw_route(axis: Axes, route: Route, overlay: Overlay) -> None:
     draw_lane(axis, route, on_ground=True)
     axis.plot(*lane_lines(route)[0].T, color=CENTRE, linewidth=1.0, linestyle=":")
     begin, end = overlay.driven or (0.0, route.length)
-    arc = np.linspace(begin, end, _PARTS)
+    arc = np.linspace(begin, end, _SAMPLES)
     line = route.pose_at(arc)
-    whole = "route, in the direction of travel"
-    axis.plot(*line[:, :2].T, color=CENTRE, linewidth=1.8, zorder=3, label=whole)
+    label = "route, in the direction of travel"
+    axis.plot(*line[:, :2].T, color=CENTRE, linewidth=1.8, zorder=3, label=label)
     for s in np.linspace(begin, end, _ARROWS + 2)[1:-1]:
         tail, head = route.pose_at(np.array([s - 0.01 * (end - begin), s]))[:, :2]
         style = {"arrowstyle": "-|>", "color": CENTRE, "mutation_scale": 14}

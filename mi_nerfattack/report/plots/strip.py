@@ -50,13 +50,13 @@ class Around:
     def views(self, field: AbstractField) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield premultiplied radiance (height, width, 3) and opacity by eye."""
         posed, camera = PosedField(field), self._camera
-        shape = (camera.height, camera.width)
+        height, width = camera.height, camera.width
         for pose in self._poses:
             origin, direction = generate_rays(camera, *pose_arrays(pose), 1)
-            seen = march(posed, Rays(origin, direction))
-            dr.eval(seen.radiance, seen.opacity)
-            radiance = seen.radiance.numpy().T.reshape(*shape, 3)
-            yield radiance.copy(), seen.opacity.numpy().reshape(shape).copy()
+            marched = march(posed, Rays(origin, direction))
+            dr.eval(marched.radiance, marched.opacity)
+            radiance = marched.radiance.numpy().T.reshape(height, width, 3)
+            yield radiance.copy(), marched.opacity.numpy().reshape(height, width).copy()
 
 
 def turntable(grid: GridField, count: int, edge_px: int) -> list[np.ndarray]:

@@ -163,7 +163,7 @@ def matrix_lines(document: Mapping[str, Any], environment: str) -> list[Line]:
         environment: one of its columns'.
     """
     columns = [c for c in document["columns"] if c["environment"] == environment]
-    found = []
+    lines = []
     for case in document["cases"]:
         cells = {}
         for column in columns:
@@ -172,10 +172,10 @@ def matrix_lines(document: Mapping[str, Any], environment: str) -> list[Line]:
             if case == ATTACK:
                 text = f"\n{figures['attacks_out']}/{column['attacks']}"
             cells[column["condition"]] = value, f"{value:.2f}{text}"
-        found.append(Line(case.replace("_", " "), cells))
-    attacks = [about["label"] for about in document["attacks"]]
+        lines.append(Line(case.replace("_", " "), cells))
+    attacks = [entry["label"] for entry in document["attacks"]]
     if ATTACK not in document["cases"] or not 1 < len(attacks) <= _MOST:
-        return found
+        return lines
     for attack in attacks:
         rows = [
             row
@@ -186,8 +186,8 @@ def matrix_lines(document: Mapping[str, Any], environment: str) -> list[Line]:
             row["condition"]: row["cases"][ATTACK]["cross_track_mean_m"] for row in rows
         }
         cells = {key: (value, f"{value:.2f}") for key, value in means.items()}
-        found.append(Line(f"  {attack[-24:]}", cells))
-    return found
+        lines.append(Line(f"  {attack[-24:]}", cells))
+    return lines
 
 
 def _label(

@@ -23,22 +23,22 @@ _DEPTHS, _ERRORS, _NOTHING = "viridis_r", "inferno", "#c8c8c8"
 
 
 def write_colours(
-    path: str | Path, views: Sequence[ViewScore], wanted: str, shown: str = "field"
+    path: str | Path, views: Sequence[ViewScore], reference: str, shown: str = "field"
 ) -> None:
     """Write image, field and error of views below each other.
 
     Args:
         path: PNG file.
         views: at least one, with their pictures, all of one size.
-        wanted: title of the column of images.
+        reference: title of the column of images.
         shown: of the field's.
     """
     scale, pictures = Normalize(0, _ERROR_MAX), _pictures(views)
     with chart(path, _height(pictures, 3)) as figure:
-        rows = _panels(figure, views, (wanted, shown, "difference"))
+        rows = _panels(figure, views, (reference, shown, "difference"))
         for pair, axes in zip(pictures, rows, strict=True):
-            error = np.abs(pair.shown.image - pair.wanted).mean(axis=2)
-            axes[0].imshow(np.clip(pair.wanted, 0, 1), interpolation="nearest")
+            error = np.abs(pair.shown.image - pair.expected).mean(axis=2)
+            axes[0].imshow(np.clip(pair.expected, 0, 1), interpolation="nearest")
             axes[1].imshow(np.clip(pair.shown.image, 0, 1), interpolation="nearest")
             _map(axes[2], error, _ERRORS, scale)
         label = "difference of sRGB values (0 to 1), mean of the channels"
@@ -63,18 +63,19 @@ def write_depths(
     """
     pictures = _pictures(views)
     shown = [pair.shown.solid_depth for pair in pictures]
-    given = [pair.depth for pair in pictures if pair.depth is not None]
-    known = len(given) == len(shown)
-    scale = Normalize(*_range([*shown, *given]))
+    known_depths = [pair.depth for pair in pictures if pair.depth is not None]
+    known = len(known_depths) == len(shown)
+    low, high = _range([*shown, *known_depths])
+    scale = Normalize(low, high)
     columns = (*titles, "difference") if known else titles[:1]
-    errors = [abs_difference(*pair) for pair in zip(shown, given, strict=False)]
+    errors = [abs_difference(*pair) for pair in zip(shown, known_depths, strict=False)]
     error_scale = Normalize(0, _top(errors))
     with chart(path, _height(pictures, 3 if known else 2)) as figure:
         rows = _panels(figure, views, columns)
         for i, axes in enumerate(rows):
             _map(axes[0], shown[i], _DEPTHS, scale)
             if known:
-                _map(axes[1], given[i], _DEPTHS, scale)
+                _map(axes[1], known_depths[i], _DEPTHS, scale)
                 _map(axes[2], errors[i], _ERRORS, error_scale)
         _bar(figure, rows, _DEPTHS, scale, f"depth along the ray ({unit})")
         if known:
@@ -112,7 +113,7 @@ def write_along(
     """
     with chart(path, 7.2) as figure:
         axes = figure.subplots(len(_ALONG), 1, sharex=True)
-        for axis, (label, factor, dashes, about) in zip(axes, _ALONG, strict=True):
+        for axis, (label, factor, dashes, note) in zip(axes, _ALONG, strict=True):
             for name, dash in dashes.items():
                 for route, colour in zip(routes, cycle(PALETTE), strict=False):
                     arc = [station.arc_m for station in route.stations]
@@ -123,9 +124,9 @@ def write_along(
                     axis.axhline(
                         limits[name], color="black", linewidth=1, linestyle=":"
                     )
-            if about:
+            if note:
                 axis.set_ylim(bottom=0)
-                axis.set_title(about, loc="right", fontsize=8, color="#555555")
+                axis.set_title(note, loc="right", fontsize=8, color="#555555")
             axis.set_ylabel(label)
             axis.grid(alpha=0.25)
         axes[-1].set_xlabel("arc length (m)")

@@ -13,7 +13,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.action import Action, Trajectory
 from mi_nerfattack.policy.base import AbstractPolicy, Numbers
 from mi_nerfattack.policy.inputs import Inputs
-from mi_nerfattack.ranges import Positive, Whole
+from mi_nerfattack.ranges import Natural, Positive
 from mi_nerfattack.scenario.policy.parts import (
     NonZero,
     PreprocessSection,
@@ -39,7 +39,7 @@ class AbstractPolicySection(Section):
     #: After `control_scale`; results do not depend on this key.
     control_unit: Annotated[Unit | None, Field(exclude=True)] = None
     #: Column of the control, where there are several; or columns of several.
-    output: OneOrSeveral[Whole] | None = None
+    output: OneOrSeveral[Natural] | None = None
     #: What the policy is given, in its order: image or names of cameras, speed, route,
     #: time, goal; by default images and goal.
     inputs: tuple[str, ...] = ()
@@ -91,7 +91,7 @@ class AbstractPolicySection(Section):
         times, section = self.own_times_s, self.trajectory
         return None if section is None else section.build(times)
 
-    def given(self, views: Views) -> Inputs:
+    def build_inputs(self, views: Views) -> Inputs:
         """Return what the policy is given; `views` as of :meth:`build`."""
         speed = "speed" in self.inputs or self.trajectory is not None
         numbers = Numbers(speed, self.route_m, "time" in self.inputs)
@@ -105,7 +105,7 @@ class AbstractPolicySection(Section):
             car: the vehicle's.
         """
         try:
-            self.given(views)
+            self.build_inputs(views)
         except InputError as error:
             refuse("policy.inputs", str(error).partition("policy.inputs: ")[2])
         check_count(self.action().count, car.control_names)
@@ -120,7 +120,7 @@ class AbstractPolicySection(Section):
                 )
 
     @model_validator(mode="after")
-    def _check_parts(self) -> Any:
+    def _check_keys(self) -> Any:
         """Refuse points that are not told, or told without distances."""
         if ("route" in self.inputs) != bool(self.route_m):
             refuse(
@@ -156,33 +156,33 @@ class AbstractPolicySection(Section):
                 refuse(f"trajectory.{key}", f"has no effect on {section.controls[0]}")
 
 
-def misfit(given: str | None, taken: str | None, source: str) -> str:
+def misfit(policy_unit: str | None, vehicle_unit: str | None, source: str) -> str:
     """Say why a vehicle does not take a policy's control; nothing if it may.
 
     Args:
-        given: unit of the policy's control; None where nothing says it.
-        taken: unit of the vehicle's control; None where nothing says it.
+        policy_unit: unit of the policy's control; None where nothing says it.
+        vehicle_unit: unit of the vehicle's control; None where nothing says it.
         source: of the policy, for the message.
     """
-    if None in (given, taken) or given == taken:
+    if None in (policy_unit, vehicle_unit) or policy_unit == vehicle_unit:
         return ""
     return (
-        f"takes {taken}, and {source} gives {given}; take another of them, convert "
-        "the control by policy.control_scale, or, with waypoints, change "
+        f"takes {vehicle_unit}, and {source} gives {policy_unit}; take another of "
+        "them, convert the control by policy.control_scale, or, with waypoints, change "
         "policy.trajectory.controls"
     )
 
 
-def check_count(given: int, names: Sequence[str]) -> None:
+def check_count(count: int, names: Sequence[str]) -> None:
     """Refuse a policy that gives more or fewer controls than its vehicle takes.
 
     Args:
-        given: number of the policy's.
+        count: number of the policy's.
         names: of the vehicle's.
     """
-    if given != len(names):
+    if count != len(names):
         refuse(
             "policy.output",
-            f"the policy gives {given}, the vehicle takes {len(names)}: "
+            f"the policy gives {count}, the vehicle takes {len(names)}: "
             f"{', '.join(names)}; give a column for each",
         )

@@ -26,7 +26,7 @@ from mi_nerfattack.policy.one_image import OneImage
 from mi_nerfattack.policy.pilotnet import PilotNet, stored_unit
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.policy.weights import load_drjit_state, load_state
-from mi_nerfattack.ranges import Positive, Whole
+from mi_nerfattack.ranges import Natural, Positive
 from mi_nerfattack.scenario.named_file import Code, File
 from mi_nerfattack.scenario.policy.base import NO_VIEWS, AbstractPolicySection, Views
 from mi_nerfattack.scenario.policy.openpilot import OpenpilotSection
@@ -70,18 +70,18 @@ class AbstractNetworkSection(AbstractPolicySection):
             self.preprocess.build(),
             recurrent,
             self.action(),
-            self.given(views),
+            self.build_inputs(views),
             self.source,
         )
 
-    def _made(self, kind: Any, wanted: str) -> Any:
+    def _made(self, kind: Any, description: str) -> Any:
         """Return the object of ``FILE.py:NAME``, or what calling it gives."""
-        found: Any = self.file.load("policy.file", self.trust_code)
-        if isinstance(found, MutableMapping | torch.nn.Module):
-            result = found  # a finished network of drjit.nn or torch.nn
+        definition: Any = self.file.load("policy.file", self.trust_code)
+        if isinstance(definition, MutableMapping | torch.nn.Module):
+            result = definition  # a finished network of drjit.nn or torch.nn
         else:
             try:
-                result = found()
+                result = definition()
             except Exception as err:
                 if is_interrupt(err):
                     raise
@@ -91,7 +91,8 @@ class AbstractNetworkSection(AbstractPolicySection):
                 ) from err
         if not isinstance(result, kind):
             raise InputError(
-                f"{self.source}: gives a {type(result).__name__}; a {wanted} is needed"
+                f"{self.source}: gives a {type(result).__name__}; a {description} is "
+                "needed"
             )
         return result
 
@@ -219,9 +220,9 @@ class CallableSection(AbstractPolicySection):
 
     def build(self, views: Views = NO_VIEWS) -> AbstractPolicy:
         """Load the function."""
-        preprocess, given = self.preprocess.build(), self.given(views)
+        preprocess, inputs = self.preprocess.build(), self.build_inputs(views)
         function = self.file.load("policy.file", self.trust_code)
-        return CallablePolicy(function, self.source, preprocess, self.action(), given)
+        return CallablePolicy(function, self.source, preprocess, self.action(), inputs)
 
 
 class HttpSection(AbstractPolicySection):
@@ -230,7 +231,7 @@ class HttpSection(AbstractPolicySection):
     kind: Literal["http"]
     url: str
     timeout_s: Positive = 10.0  # of an answer
-    retries: Whole = 2
+    retries: Natural = 2
     token_file: Annotated[File | None, Field(exclude=True)] = None  # no result's
 
     def build(self, views: Views = NO_VIEWS) -> AbstractPolicy:
@@ -241,7 +242,7 @@ class HttpSection(AbstractPolicySection):
             self.retries,
             self.preprocess.build(),
             self.action(),
-            self.given(NO_VIEWS),  # the server gets the frame as it is
+            self.build_inputs(NO_VIEWS),  # the server gets the frame as it is
             "" if self.token_file is None else read_token(self.token_file.file),
         )
 

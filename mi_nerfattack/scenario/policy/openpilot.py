@@ -20,7 +20,7 @@ from mi_nerfattack.policy.onnx.openpilot import (
 )
 from mi_nerfattack.policy.preprocess import Preprocess
 from mi_nerfattack.policy.torch_policy import TorchPolicy
-from mi_nerfattack.ranges import Count, NonNegative, Whole
+from mi_nerfattack.ranges import Count, Natural, NonNegative
 from mi_nerfattack.scenario.named_file import File
 from mi_nerfattack.scenario.policy.base import NO_VIEWS, AbstractPolicySection, Views
 from mi_nerfattack.scenario.policy.parts import PreprocessSection, TrajectorySection
@@ -35,8 +35,8 @@ class OpenpilotSection(AbstractPolicySection):
     kind: Literal["openpilot"]
     file: File  # the policy network
     vision_file: File
-    features: tuple[Whole, Whole]  # the hidden state in the vision's output
-    plan: tuple[Whole, Whole]  # in the policy's output
+    features: tuple[Natural, Natural]  # the hidden state in the vision's output
+    plan: tuple[Natural, Natural]  # in the policy's output
     stride: Count = 4  # control periods between two features of the policy's input
     frame_stride: Count = 4  # control periods between the two frames of an image
     traffic: Literal["right", "left"] = "right"
@@ -50,11 +50,11 @@ class OpenpilotSection(AbstractPolicySection):
         """Load both networks."""
         missing = [name for name in CAMERAS if name not in views]
         if missing:
-            given = ", ".join(views) or "those of one camera"
+            cameras = ", ".join(views) or "those of one camera"
             raise InputError(
                 f"{self.source}: takes images of cameras called "
-                f"{' and '.join(CAMERAS)}, and gets {given}; give the scenario a table "
-                "[[cameras]] for each of these names"
+                f"{' and '.join(CAMERAS)}, and gets {cameras}; give the scenario a "
+                "table [[cameras]] for each of these names"
             )
         module: Any = Openpilot(
             load_onnx(self.vision_file.file, rounds=True),
@@ -75,11 +75,11 @@ class OpenpilotSection(AbstractPolicySection):
             Preprocess(transforms, 2, self.frame_stride),
             recurrent,
             self.action(),
-            self.given(views),
+            self.build_inputs(views),
             self.source,
         )
 
-    def given(self, views: Views) -> Inputs:
+    def build_inputs(self, views: Views) -> Inputs:
         """Return what the networks are given."""
         return Inputs((*CAMERAS, "speed"), Numbers(speed=True), views)
 

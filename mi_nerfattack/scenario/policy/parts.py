@@ -22,7 +22,7 @@ from mi_nerfattack.policy.preprocess import (
     to_grey,
     to_yuv,
 )
-from mi_nerfattack.ranges import Count, Finite, NonNegative, Positive, Whole
+from mi_nerfattack.ranges import Count, Finite, Natural, NonNegative, Positive
 from mi_nerfattack.scenario.section import Section, refuse
 
 COLOURS: dict[str, Callable[[], AbstractTransform]] = {
@@ -46,8 +46,9 @@ NonZero = Annotated[Finite, AfterValidator(_not_zero)]
 class PreprocessSection(Section):
     """From the camera's image to the policy's input, in the order of the keys."""
 
-    crop_px: tuple[Whole, Whole, Whole, Whole] | None = None  # see crop_fraction
-    crop_fraction: tuple[Part, Part, Part, Part] | None = None  # top bottom left right
+    # Both crops: top, bottom, left, right
+    crop_px: tuple[Natural, Natural, Natural, Natural] | None = None
+    crop_fraction: tuple[Part, Part, Part, Part] | None = None
     resize_px: tuple[Count, Count] | None = None  # width, height
     filter: Literal["antialias", "bilinear", "area"] = "antialias"
     colour: Literal["srgb", "linear", "yuv", "grey", "bgr"] = "srgb"

@@ -181,14 +181,14 @@ def future_positions(
         (n, k, 2), metres forward and to the left of each pose.
     """
     ahead = np.asarray(times, np.float64)
-    whole = np.floor(ahead / period + 1e-6)  # periods before the last one
+    full_periods = np.floor(ahead / period + 1e-6)  # periods before the last one
     start = np.asarray(poses, np.float64)[:, :3]
     state, world = start, np.empty((len(start), len(ahead), 2))
-    for step in range(int(whole.max()) + 1):
+    for step in range(int(full_periods.max()) + 1):
         rate = expert.control(state).reshape(len(state), -1)[:, 0]
         if expert.control_unit == "rad":
             rate = heading_rate(rate, speed, wheelbase)
-        for index in np.flatnonzero(whole == step):
+        for index in np.flatnonzero(full_periods == step):
             seconds = max(0.0, ahead[index] - step * period)
             world[:, index] = _along_arc(state, rate, speed, seconds)[:, :2]
         state = _along_arc(state, rate, speed, period)

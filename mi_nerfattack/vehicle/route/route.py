@@ -14,7 +14,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.io.strict import require_near
 from mi_nerfattack.notebook import picture
-from mi_nerfattack.ranges import Positive, Whole, checked
+from mi_nerfattack.ranges import Natural, Positive, checked
 from mi_nerfattack.vehicle.route.polyline import (
     Measures,
     Operations,
@@ -51,7 +51,7 @@ class Route:
     """
 
     name: str
-    goal: Whole
+    goal: Natural
     points: np.ndarray
     lane_width_m: Positive = 3.5
     speed_ms: Positive = 5.0
@@ -299,9 +299,9 @@ class _Segments:
         start = dr.ones(self.integer, dr.width(arc))
         _, index = dr.while_loop(
             (start, dr.zeros_like(start)),
-            lambda i, found: i < self.count,
-            lambda i, found: (i + 1, dr.select(self.at(i).arc <= arc, i, found)),
-            labels=("segment", "found"),
+            lambda i, last: i < self.count,
+            lambda i, last: (i + 1, dr.select(self.at(i).arc <= arc, i, last)),
+            labels=("segment", "last"),
             mode="symbolic",
         )
         return self.at(index)

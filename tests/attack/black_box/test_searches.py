@@ -43,22 +43,22 @@ def grey(count: int = 1) -> list[GridField]:
     return fields
 
 
-class Wanted:
+class ColourJudge:
     """Judges by the distance to colours, which are others in each eighth of a box."""
 
     def __init__(self, fields: list[GridField]) -> None:
         self.fields = fields
         edge = fields[0].levels()[-1].resolution
         half = (np.arange(edge) >= edge // 2).astype(np.float32)
-        self.wanted = np.stack(np.meshgrid(half, half, half), -1).reshape(-1, 3)
+        self.target = np.stack(np.meshgrid(half, half, half), -1).reshape(-1, 3)
 
     def __call__(self, textures, on_step=None) -> Judged:
         del on_step
         far = []
         for field, texture in zip(self.fields, textures, strict=True):
             field.set_parameter("texture", texture)
-            found = vertex_colours(field, field.levels()[-1])
-            far.append(np.abs(found - self.wanted).mean())
+            colours = vertex_colours(field, field.levels()[-1])
+            far.append(np.abs(colours - self.target).mean())
         return Judged(float(np.mean(far)), 0.0, 0.0, 1)
 
 
@@ -75,7 +75,7 @@ def make(kind: str, fields: list[GridField], seed: int = 1):
 
 def attacked(kind: str, count: int = 1, proposals: int = PROPOSALS) -> BlackBoxAttack:
     fields = grey(count)
-    attack = BlackBoxAttack(make(kind, fields), Wanted(fields), proposals)
+    attack = BlackBoxAttack(make(kind, fields), ColourJudge(fields), proposals)
     while not attack.is_over:
         attack.step()
     return attack
@@ -100,26 +100,26 @@ def test_searches_get_nearer(kind, floor):
 
 def test_a_gaussian_process_finds_the_colours_of_two_boxes():
     fields = grey(2)
-    judge = Wanted(fields)
-    judge.wanted = np.array([0.9, 0.1, 0.5])
+    judge = ColourJudge(fields)
+    judge.target = np.array([0.9, 0.1, 0.5])
     attack = BlackBoxAttack(make("bayesian", fields), judge, 40)
     while not attack.is_over:
         attack.step()
-    drawn, found = attack.curve()[[9, -1], 1]  # the first ten are random
-    assert found < 0.5 * drawn
+    drawn, best = attack.curve()[[9, -1], 1]  # the first ten are random
+    assert best < 0.5 * drawn
 
 
 @pytest.mark.parametrize("kind", ["random", "blocks", "separable", "bayesian"])
 def test_an_attack_that_is_told_the_same_goes_on_alike(kind):
-    whole = attacked(kind, proposals=16)
+    uninterrupted = attacked(kind, proposals=16)
     half = attacked(kind, proposals=12)
     fields = grey()
-    again = BlackBoxAttack(make(kind, fields), Wanted(fields), 16)
+    again = BlackBoxAttack(make(kind, fields), ColourJudge(fields), 16)
     again.load_tensors(half.tensors())
     while not again.is_over:
         again.step()
-    assert again.history == whole.history
-    np.testing.assert_array_equal(again.best, whole.best)
+    assert again.history == uninterrupted.history
+    np.testing.assert_array_equal(again.best, uninterrupted.best)
 
 
 def test_seeds_give_other_proposals():
@@ -192,7 +192,7 @@ def test_blocks_lie_where_the_object_is_and_shrink():
 def test_penalties_count(monkeypatch):
     fields = grey()
     monkeypatch.setattr(Colours, "penalty", lambda self, value: 5.0)
-    attack = BlackBoxAttack(make("separable", fields), Wanted(fields), 1)
+    attack = BlackBoxAttack(make("separable", fields), ColourJudge(fields), 1)
     assert attack.step().objective > 5
 
 
@@ -209,15 +209,18 @@ def nowhere(textures, on_step=None):
         (lambda c, f: BayesianSearch(LowFrequency(c, 81)), "81; .* 64"),
         (lambda c, f: BlockSearch(c, f, 0), "0 proposals"),
         (lambda c, f: BlockSearch(c, f, 9, 0.0), "share 0"),
-        (lambda c, f: BlackBoxAttack(make("blocks", f), Wanted(f), 0), "frames: 0"),
+        (
+            lambda c, f: BlackBoxAttack(make("blocks", f), ColourJudge(f), 0),
+            "frames: 0",
+        ),
         (
             lambda c, f: RandomSearch(RandomLooks(f, Freedom(None, 1), "flat", 0)),
             "may not",
         ),
         (
-            lambda c, f: BlackBoxAttack(make("blocks", f), Wanted(f), 5).load_tensors(
-                {"history": np.zeros((2, 3))}
-            ),
+            lambda c, f: BlackBoxAttack(
+                make("blocks", f), ColourJudge(f), 5
+            ).load_tensors({"history": np.zeros((2, 3))}),
             "history: shape",
         ),
         (
@@ -241,8 +244,8 @@ def test_drives_are_judged_as_the_gradient_judges_its_own():
     record = GradientAttack(rollout, toy.ROUTE, initial).measure()
     judged = SurrogateJudge(rollout, toy.ROUTE, initial)([toy.texture_of(field)])
     assert judged.frames == 10
-    found = judged.objective, judged.cross_track_mean_m, judged.cross_track_max_m
-    assert found == pytest.approx(astuple(record)[1:4], rel=1e-5)
+    actual = judged.objective, judged.cross_track_mean_m, judged.cross_track_max_m
+    assert actual == pytest.approx(astuple(record)[1:4], rel=1e-5)
 
 
 def draws(freedom, seed=3):
@@ -262,10 +265,10 @@ def test_what_the_attack_may_not_change_is_left_alone():
 def test_poses_fill_the_limits_and_nothing_else():
     axes = ("x", "yaw")
     looks = draws(Freedom(None, 0.02, axes, limit_m=0.4, limit_rad=0.2))
-    found = np.concatenate([looks.offsets(number) for number in range(400)])
-    assert not found[:, [1, 2, 3, 4]].any()
+    offsets = np.concatenate([looks.offsets(number) for number in range(400)])
+    assert not offsets[:, [1, 2, 3, 4]].any()
     for column, limit in ((0, 0.4), (5, 0.2)):
-        values = found[:, column] / limit
+        values = offsets[:, column] / limit
         assert 0.97 < values.max() <= 1 and -1 <= values.min() < -0.97
         assert values.std() == pytest.approx(1 / np.sqrt(3), rel=0.1)
 

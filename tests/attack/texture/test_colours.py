@@ -58,9 +58,9 @@ def test_gradient_is_that_of_the_texture(rng):
     value = rng.uniform(0.2, 0.8, colours.start.shape)
     change = 1e-4 * rng.normal(size=value.shape)
     up, down = (colours.texture(value + s * change) for s in (1, -1))
-    wanted = ((up.astype(np.float64) - down) * by_texture).sum() / 2
-    found = (colours.gradient(value, by_texture) * change).sum()
-    assert found == pytest.approx(wanted, rel=1e-3)
+    expected = ((up.astype(np.float64) - down) * by_texture).sum() / 2
+    derivative = (colours.gradient(value, by_texture) * change).sum()
+    assert derivative == pytest.approx(expected, rel=1e-3)
     level = Colours(field, resolution=8).level
     assert level.resolution == 7
     with pytest.raises(InputError, match="resolution: 3; .* 4"):
@@ -115,35 +115,35 @@ def test_statistics_of_a_texture_that_is_known():
     grey = np.zeros_like(original)
     white = grey + 9.0  # the sum of three levels: 27
     grid.set_parameter("texture", mi.TensorXf(white))
-    found = texture_statistics(grid, grey, weights)
-    assert found.l2 == pytest.approx(0.5, abs=1e-5)
-    assert found.linf == pytest.approx(0.5, abs=1e-5)
-    assert found.saturated_share == pytest.approx(1)
-    assert found.total_variation == pytest.approx(0, abs=1e-6)
+    painted = texture_statistics(grid, grey, weights)
+    assert painted.l2 == pytest.approx(0.5, abs=1e-5)
+    assert painted.linf == pytest.approx(0.5, abs=1e-5)
+    assert painted.saturated_share == pytest.approx(1)
+    assert painted.total_variation == pytest.approx(0, abs=1e-6)
     assert same.spectrum == []
-    assert found.spectrum[-1] == pytest.approx(1)  # all of it is the mean
+    assert painted.spectrum[-1] == pytest.approx(1)  # all of it is the mean
     unseen = texture_statistics(grid, grey, np.zeros_like(weights))
     assert astuple(unseen) == (0, 0, 0, 0, [])
 
 
 def test_measuring_that_fails_leaves_the_texture(monkeypatch):
     loop, grid = toy.make_loop()
-    given = toy.texture_of(grid)
+    original = toy.texture_of(grid)
 
     def fail(*_):
-        assert not np.array_equal(toy.texture_of(grid), given)
+        assert not np.array_equal(toy.texture_of(grid), original)
         raise MemoryError
 
     monkeypatch.setattr(type(loop.sensor), "observe", fail)
     with pytest.raises(MemoryError):
         statistics.seen_weights(loop.sensor, [grid], [loop.initial(np.zeros((1, 3)))])
-    np.testing.assert_array_equal(toy.texture_of(grid), given)
+    np.testing.assert_array_equal(toy.texture_of(grid), original)
     colours = iter([lambda *_: 0.0, fail])
     monkeypatch.setattr(statistics, "vertex_colours", lambda *a: next(colours)(*a))
     edge = grid.levels()[-1].resolution
     with pytest.raises(MemoryError):
-        statistics.texture_statistics(grid, given + 1, np.ones((edge,) * 3))
-    np.testing.assert_array_equal(toy.texture_of(grid), given)
+        statistics.texture_statistics(grid, original + 1, np.ones((edge,) * 3))
+    np.testing.assert_array_equal(toy.texture_of(grid), original)
 
 
 def test_spectrum_tells_fine_structure_from_coarse():
@@ -151,12 +151,12 @@ def test_spectrum_tells_fine_structure_from_coarse():
     original = grid.texture.numpy().copy()
     index = np.indices((8, 8, 8)).reshape(3, -1)
     everywhere = np.ones((8, 8, 8))
-    for period, wanted in ((1, [1, 0, 0, 0]), (2, [0, 1, 0, 0]), (8, [0, 0, 0, 1])):
+    for period, expected in ((1, [1, 0, 0, 0]), (2, [0, 1, 0, 0]), (8, [0, 0, 0, 1])):
         board = 1 - 2 * (index // period % 2).max(axis=0)
         raw = original + board[:, None].astype(np.float32)
-        if wanted[-1] == 0:
+        if expected[-1] == 0:
             raw -= raw.reshape(-1, 3).mean(axis=0)
         grid.set_parameter("texture", raw)
-        found = texture_statistics(grid, original, everywhere).spectrum
-        assert sum(found) == pytest.approx(1)
-        assert found == pytest.approx(wanted, abs=0.06)
+        spectrum = texture_statistics(grid, original, everywhere).spectrum
+        assert sum(spectrum) == pytest.approx(1)
+        assert spectrum == pytest.approx(expected, abs=0.06)

@@ -42,10 +42,10 @@ def far_off(mine, rng):
 
 def test_boxes_bound_every_value(field, rng):
     mine = colours(field, linf=0.1, lowest=0.2, highest=0.7)
-    found = mine.project(far_off(mine, rng))
-    assert np.abs(found - mine.start).max() <= 0.1 + 1e-6
-    assert found.min() >= 0.2 - 1e-6
-    assert found.max() <= 0.7 + 1e-6
+    projected = mine.project(far_off(mine, rng))
+    assert np.abs(projected - mine.start).max() <= 0.1 + 1e-6
+    assert projected.min() >= 0.2 - 1e-6
+    assert projected.max() <= 0.7 + 1e-6
     # the original is drawn into the range, and the picture shows it
     field.set_parameter("texture", mine.texture(mine.start))
     assert colours(field).start.min() >= 0.2 - 1e-4
@@ -53,9 +53,9 @@ def test_boxes_bound_every_value(field, rng):
 
 def test_ball_bounds_the_mean_square_over_occupied_cells(field, rng):
     mine = colours(field, l2=0.05)
-    found = mine.project(far_off(mine, rng))
+    projected = mine.project(far_off(mine, rng))
     n = mine.level.resolution
-    change = (found - mine.start).reshape(n, n, n, 3)[:, :, 2:7]  # z, y, x
+    change = (projected - mine.start).reshape(n, n, n, 3)[:, :, 2:7]  # z, y, x
     assert np.sqrt((change.astype(float) ** 2).mean()) == pytest.approx(0.05, rel=1e-4)
     near = mine.start + np.float32(0.001) * (mine.start < 0.5)
     np.testing.assert_array_equal(mine.project(near), near)
@@ -63,17 +63,17 @@ def test_ball_bounds_the_mean_square_over_occupied_cells(field, rng):
 
 def test_fixed_regions_stay(field, rng):
     mine = colours(field, fixed=(((-1, -1, -1), (1, 1, 0.1)),))
-    found = mine.project(far_off(mine, rng)).clip(0.01, 0.99)
+    projected = mine.project(far_off(mine, rng)).clip(0.01, 0.99)
     n = mine.level.resolution
-    changed = (found != mine.start).reshape(n, n, n, 3).any(axis=(1, 2, 3))
+    changed = (projected != mine.start).reshape(n, n, n, 3).any(axis=(1, 2, 3))
     assert changed.tolist() == [False] * 6 + [True] * 3  # by z
     points = mi.Point3f(rng.uniform(-1, 0.1, (3, 200)).tolist())
-    seen = []
-    for value in (mine.start, found):
+    shown = []
+    for value in (mine.start, projected):
         field.set_parameter("texture", mine.texture(value))
         looked = field.eval_everywhere(points, mi.Vector3f(0, 0, 1), mi.Bool(True))
-        seen.append(np.array(looked[1]))
-    np.testing.assert_array_equal(*seen)
+        shown.append(np.array(looked[1]))
+    np.testing.assert_array_equal(*shown)
     with pytest.raises(InputError, match=r"fixed: \(3, 3, 3\) to .*the object lies in"):
         colours(field, fixed=(((3, 3, 3), (4, 4, 4)),))
 
@@ -86,10 +86,10 @@ def test_penalty_is_the_variation_and_its_gradient_that_of_it(field, rng):
     pairs = [np.abs(np.diff(cube, axis=axis)).ravel() for axis in range(3)]
     assert mine.penalty(value) == pytest.approx(3 * np.concatenate(pairs).mean(), 0.01)
     change = 1e-4 * rng.normal(size=value.shape)
-    wanted = (mine.penalty(value + change) - mine.penalty(value - change)) / 2
+    expected = (mine.penalty(value + change) - mine.penalty(value - change)) / 2
     nothing = np.zeros((field.n_vertices, 3))
-    found = (mine.gradient(value, nothing) * change).sum()
-    assert found == pytest.approx(wanted, rel=1e-3)
+    derivative = (mine.gradient(value, nothing) * change).sum()
+    assert derivative == pytest.approx(expected, rel=1e-3)
 
 
 test_what_allows_nothing_is_refused = refusals(
@@ -106,14 +106,14 @@ test_what_allows_nothing_is_refused = refusals(
 def test_colours_are_drawn_into_the_hull(rng):
     gamut = Gamut(CORNERS)
     colours = rng.uniform(0, 1, (500, 3))
-    found = gamut.draw(colours, gamut.centre)
-    assert found.min() >= 0.2
-    assert found.max() <= 0.7
+    drawn = gamut.draw(colours, gamut.centre)
+    assert drawn.min() >= 0.2
+    assert drawn.max() <= 0.7
     inside = ((colours >= 0.2) & (colours <= 0.7)).all(axis=1)
     assert 20 < inside.sum() < 480
-    np.testing.assert_array_equal(found[inside], colours[inside])
+    np.testing.assert_array_equal(drawn[inside], colours[inside])
     # what is outside ends on the border, on the way to the centre
-    moved = found[~inside] - gamut.centre
+    moved = drawn[~inside] - gamut.centre
     assert np.abs(moved).max(axis=1) == pytest.approx(0.25, abs=1e-3)
     assert np.cross(moved, colours[~inside] - gamut.centre) == pytest.approx(0)
 
@@ -124,11 +124,11 @@ def test_attacks_keep_to_the_gamut_and_to_other_constraints(variant, rng):
     field.set_parameter("texture", texture)  # mostly outside
     allowed = Constraints(linf=0.1, highest=0.6, gamut=Gamut(CORNERS))
     mine = Colours(field, constraints=allowed)
-    found = mine.project(mine.start + rng.normal(0, 1, mine.start.shape))
-    for colours in (mine.start, found):
+    projected = mine.project(mine.start + rng.normal(0, 1, mine.start.shape))
+    for colours in (mine.start, projected):
         assert colours.min() >= 0.2
         assert colours.max() <= 0.6 + 1e-6
-    change = np.abs(found - mine.start)
+    change = np.abs(projected - mine.start)
     assert change.max() <= 0.1 + 1e-6
     assert np.median(change) > 0.01
 

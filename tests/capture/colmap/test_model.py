@@ -123,9 +123,9 @@ def test_everything_is_as_written(tmp_path, write):
     ):
         q, t, camera_id = POSES[name]
         for point in POINTS:
-            parts = q, t, np.array(point), lenses[camera_id == 7]
-            found = our_pixel(camera, pose, point)
-            np.testing.assert_allclose(found, colmap_projection(*parts), atol=1e-6)
+            arguments = q, t, np.array(point), lenses[camera_id == 7]
+            pixel = our_pixel(camera, pose, point)
+            np.testing.assert_allclose(pixel, colmap_projection(*arguments), atol=1e-6)
     # R maps world (x, y, z) to camera (z, y, -x); so the eye is -R^T t
     np.testing.assert_allclose(posed.camera_to_world[1, :3, 3], [4.0, 0.2, -0.3])
     np.testing.assert_allclose(posed.camera_to_world[1, :3, 2], [-1, 0, 0], atol=1e-12)

@@ -66,20 +66,20 @@ def test_a_driver_sees_the_picture_upright(kind):
     rng = np.random.default_rng(0)
     shares = rng.uniform(0.05, 0.45, (40, 2)) + 0.5 * rng.integers(2, size=(40, 2))
     right, down = shares.T
-    seen, length = look(made(kind), on_sheet(kind, right, down))
+    integrals, length = look(made(kind), on_sheet(kind, right, down))
     expected = QUARTERS[(down > 0.5).astype(int), (right > 0.5).astype(int)]
     expected = srgb_to_linear_numpy(expected / 255)
-    np.testing.assert_allclose(seen.radiance.numpy().T, expected, atol=2e-3)
-    np.testing.assert_allclose(seen.opacity.numpy(), 1, atol=1e-4)
-    depth = seen.moment.numpy() / seen.opacity.numpy()
+    np.testing.assert_allclose(integrals.radiance.numpy().T, expected, atol=2e-3)
+    np.testing.assert_allclose(integrals.opacity.numpy(), 1, atol=1e-4)
+    depth = integrals.moment.numpy() / integrals.opacity.numpy()
     np.testing.assert_allclose(depth, length, atol=2e-3)
 
 
 @pytest.mark.parametrize("kind", FLAT_FACES)
 def test_beside_the_sheet_is_nothing(kind):
     beyond = np.array([[-0.01, 0.5], [1.01, 0.5], [0.5, -0.01], [0.5, 1.01]])
-    seen, _ = look(made(kind), on_sheet(kind, *beyond.T))
-    assert not seen.opacity.numpy().any()
+    integrals, _ = look(made(kind), on_sheet(kind, *beyond.T))
+    assert not integrals.opacity.numpy().any()
 
 
 @pytest.mark.parametrize("kind", FLAT_FACES)
@@ -101,20 +101,20 @@ def test_size_and_picture_stay_in_the_file(tmp_path, kind):
 
 @pytest.mark.parametrize("kind", FLAT_FACES)
 def test_built_in_the_sheet_has_the_albedo_of_the_picture(kind):
-    found = make_built_in(made(kind), POSE)
+    built_in = make_built_in(made(kind), POSE)
     edges = on_sheet(kind, np.array([0.0, 1.0]), np.array([1.0, 0.0]))
-    np.testing.assert_allclose(found.vertices.min(0), edges[0], atol=1e-9)
-    np.testing.assert_allclose(found.vertices.max(0), edges[1], atol=1e-9)
-    assert len(found.faces) == 2
-    height, width, _ = found.image.shape
+    np.testing.assert_allclose(built_in.vertices.min(0), edges[0], atol=1e-9)
+    np.testing.assert_allclose(built_in.vertices.max(0), edges[1], atol=1e-9)
+    assert len(built_in.faces) == 2
+    height, width, _ = built_in.image.shape
     up_axis, weights = 2 if kind == "billboard" else 1, np.array([0.7, 0.15, 0.15])
-    for face in found.faces:
-        corners, uv = found.vertices[face], found.uv[face]
+    for face in built_in.faces:
+        corners, uv = built_in.vertices[face], built_in.uv[face]
         normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
         assert normal @ (EYE - corners[0]) > 0
         # a point of the triangle that lies inside of one quarter
         point, (u, v) = weights @ corners, weights @ uv
-        texel = found.image[int((1 - v) * height), int(u * width)]
+        texel = built_in.image[int((1 - v) * height), int(u * width)]
         middle = (edges[0] + edges[1])[up_axis] / 2
         is_low = point[up_axis] < middle
         quarter = QUARTERS[int(is_low), int(point[0] > 0)]

@@ -37,7 +37,7 @@ def plain(**attributes) -> tuple[Gltf, dict, dict]:
 def vertices(gltf: Gltf, path) -> np.ndarray:
     """Return all vertices in the axes of the file."""
     mesh = load_mesh(gltf.write(path))
-    return np.concatenate([part.vertices for part in mesh.parts]) @ TO_Z_UP
+    return np.concatenate([part.vertices for part in mesh.submeshes]) @ TO_Z_UP
 
 
 def rigid(rng) -> np.ndarray:
@@ -54,9 +54,9 @@ def test_joints_place_a_mesh_with_a_skin(tmp_path, rng, weight_type):
     joints, bind = np.stack([rigid(rng), rigid(rng)]), np.stack([rigid(rng)] * 2)
     attributes["JOINTS_0"] = gltf.array(np.tile([1, 0, 0, 0], (4, 1)), "u1")
     full = np.pad(weights, ((0, 0), (0, 2)))
-    whole = weight_type == "u1"
-    stored = np.rint(255 * full) if whole else full
-    attributes["WEIGHTS_0"] = gltf.array(stored, weight_type, normalized=whole)
+    is_integer = weight_type == "u1"
+    stored = np.rint(255 * full) if is_integer else full
+    attributes["WEIGHTS_0"] = gltf.array(stored, weight_type, normalized=is_integer)
     columns = gltf.array(np.swapaxes(bind, 1, 2).reshape(-1, 16))
     gltf.tree["skins"] = [{"joints": [2, 1], "inverseBindMatrices": columns}]
     gltf.tree["nodes"] = [
@@ -68,12 +68,12 @@ def test_joints_place_a_mesh_with_a_skin(tmp_path, rng, weight_type):
     places = np.stack([joints[0] @ joints[1], joints[0]]) @ bind  # of joints 0 and 1
     blend = np.einsum("vj,jab->vab", weights[:, ::-1], places)
     expected = np.einsum("vab,vb->va", blend, np.c_[PLATE, np.ones(4)])[:, :3]
-    found = load_mesh(gltf.write(tmp_path / "a.glb")).parts[0]
-    np.testing.assert_allclose(found.vertices @ TO_Z_UP, expected, atol=1e-5)
+    part = load_mesh(gltf.write(tmp_path / "a.glb")).submeshes[0]
+    np.testing.assert_allclose(part.vertices @ TO_Z_UP, expected, atol=1e-5)
     normal = np.linalg.inv(blend[:, :3, :3])[:, 2]  # of the transposed inverse
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     normal *= np.sign(np.linalg.det(blend[:, :3, :3]))[:, None]
-    np.testing.assert_allclose(found.normals @ TO_Z_UP, normal, atol=1e-5)
+    np.testing.assert_allclose(part.normals @ TO_Z_UP, normal, atol=1e-5)
 
 
 def test_a_file_of_instances_has_all_of_them(tmp_path, rng):
@@ -88,8 +88,8 @@ def test_a_file_of_instances_has_all_of_them(tmp_path, rng):
     gltf.tree["nodes"] = [{**node, "extensions": {name: {"attributes": attributes}}}]
     gltf.tree["extensionsUsed"] = [name]
     copies = [turn[i].apply(PLATE * size[i]) + shift[i] + [1, 2, 3] for i in range(3)]
-    found = np.sort(vertices(gltf, tmp_path / "a.gltf"), 0)
-    np.testing.assert_allclose(found, np.sort(np.concatenate(copies), 0), atol=1e-5)
+    points = np.sort(vertices(gltf, tmp_path / "a.gltf"), 0)
+    np.testing.assert_allclose(points, np.sort(np.concatenate(copies), 0), atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -178,8 +178,8 @@ def test_pictures_of_a_cube_are_each_on_its_face_and_upright_from_outside():
         image = seen_from(cube, normal)[[14, 14, 50, 50], [14, 50, 14, 50], :3]
         rgb = linear_to_uint8(image).astype(int).reshape(2, 2, 3)
         # from below, a camera has +y on top, the picture of a face -y
-        wanted = shades[name] * (CORNERS[::-1, ::-1] if name == "nz" else CORNERS)
-        np.testing.assert_allclose(rgb, wanted, atol=3, err_msg=name)
+        expected = shades[name] * (CORNERS[::-1, ::-1] if name == "nz" else CORNERS)
+        np.testing.assert_allclose(rgb, expected, atol=3, err_msg=name)
 
 
 ROOT = Path(__file__).parents[3]
@@ -199,9 +199,9 @@ def test_arrays_come_back(smooth: bool, textured: bool) -> None:
     normals = np.tile([-0.6, 0.0, 0.8], (4, 1)) if smooth else None
     uv = np.array([[0.0, 0.25], [1, 0], [1, 1], [0, 1]]) if textured else None
     arrays = MeshArrays(vertices, faces, normals, uv)
-    found = read_mesh(make_mesh("quad", arrays))
+    read_arrays = read_mesh(make_mesh("quad", arrays))
     for name in ("vertices", "faces", "normals", "uv"):
-        value, expected = getattr(found, name), getattr(arrays, name)
+        value, expected = getattr(read_arrays, name), getattr(arrays, name)
         assert (value is None) == (expected is None)
         if expected is not None:
             np.testing.assert_allclose(value, expected, atol=1e-6)
@@ -216,17 +216,17 @@ def test_a_ray_meets_vertices_normals_coordinates_and_colours() -> None:
     bsdf = mi.load_dict({"type": "diffuse", "reflectance": reflectance})
     scene = mi.load_dict({"type": "scene", "mesh": make_mesh("m", arrays, bsdf)})
     si = scene.ray_intersect(mi.Ray3f([0.5, 0.25, 2], [0, 0, -1]))
-    for found, expected in (
+    for quantity, expected in (
         (si.p, [0.5, 0.25, 0]),
         (si.sh_frame.n, normals[0]),
         (si.uv, [0.25, 0.125]),
         (si.bsdf().eval_diffuse_reflectance(si), [0.25, 0.5, 0.25] @ colour),
     ):
-        np.testing.assert_allclose(np.array(found).ravel(), expected, atol=1e-6)
+        np.testing.assert_allclose(np.array(quantity).ravel(), expected, atol=1e-6)
 
 
 def test_no_other_file_names_the_class_and_its_parameters() -> None:
-    here = {Path(mitsuba_mesh.__file__).resolve(), Path(__file__).resolve()}
+    allowed = {Path(mitsuba_mesh.__file__).resolve(), Path(__file__).resolve()}
     paths = [path for name in FOLDERS for path in (ROOT / name).rglob("*.py")]
-    others = [path for path in paths if path.resolve() not in here]
+    others = [path for path in paths if path.resolve() not in allowed]
     assert [p for p in others if NAMES.search(p.read_text("utf-8"))] == []

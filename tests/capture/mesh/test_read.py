@@ -77,8 +77,8 @@ class TestTextures:
         gltf = plate(TEXCOORD_1=[[1, 1], [0, 1], [0, 0], [1, 0]])
         index = gltf.texture(four_colours(), **wrap)
         gltf.material(baseColorTexture={"index": index, **info})
-        found = front(gltf, tmp_path, name=name)
-        np.testing.assert_allclose(found, np.broadcast_to(expected, (2, 2, 3)), atol=3)
+        pixels = front(gltf, tmp_path, name=name)
+        np.testing.assert_allclose(pixels, np.broadcast_to(expected, (2, 2, 3)), atol=3)
 
     def test_factor_and_vertex_colours_multiply_the_texture(self, tmp_path):
         shade = np.array([[0.5] * 3, [1] * 3, [1] * 3, [0.5] * 3])
@@ -102,8 +102,8 @@ def test_obj(tmp_path):
         "mtllib a.mtl\nv 0 0 0\nv 2 0 0\nv 2 1 0\nv 0 1 0\n"
         "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nusemtl A\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
     )
-    seen = cells(seen_from(load_mesh(tmp_path / "a.obj"), FRONT), 2, 2)
-    rgb = linear_to_uint8(seen[..., :3]).astype(int)
+    cell_colours = cells(seen_from(load_mesh(tmp_path / "a.obj"), FRONT), 2, 2)
+    rgb = linear_to_uint8(cell_colours[..., :3]).astype(int)
     np.testing.assert_allclose(rgb, CORNERS, atol=3)
 
 
@@ -154,7 +154,7 @@ class TestMaterials:
             # 256 samples a pixel, 1344 pixels
             assert middle(gltf, tmp_path)[3] == pytest.approx(alpha, abs=5e-3)
         del material["pbrMetallicRoughness"]["baseColorTexture"]
-        assert not load_mesh(gltf.write(tmp_path / "a.glb")).parts[0].is_solid
+        assert not load_mesh(gltf.write(tmp_path / "a.glb")).submeshes[0].is_solid
 
     def test_specular_glossiness_and_what_loses_only_gloss(self, tmp_path):
         names = ["pbrSpecularGlossiness", "sheen", "ior", "unlit", "emissive_strength"]
@@ -194,7 +194,7 @@ class TestNodes:
         indices = gltf.array(ball.faces.ravel(), "u4")
         primitive(gltf).update(attributes=attributes, indices=indices)
         gltf.tree["nodes"][0]["scale"] = [1, -1, 3]
-        part = load_mesh(gltf.write(tmp_path / "a.glb")).parts[0]
+        part = load_mesh(gltf.write(tmp_path / "a.glb")).submeshes[0]
         # an ellipsoid x^2 + z^2 + (y / 3)^2 = 1 in our axes: its gradient
         normal = part.vertices / [1, 9, 1]
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -208,8 +208,8 @@ def test_up_is_a_rotation_that_lifts_the_axis(tmp_path, up):
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]])
     rows = "".join("v {} {} {}\n".format(*p) for p in points)
     (tmp_path / "a.obj").write_text(rows + "f 1 2 3\nf 1 3 4\nf 2 3 4\n")
-    found = load_mesh(tmp_path / "a.obj", up).parts[0].vertices
-    matrix = np.stack([found[1], found[2] / 2, found[3] / 3], axis=1)
+    vertices = load_mesh(tmp_path / "a.obj", up).submeshes[0].vertices
+    matrix = np.stack([vertices[1], vertices[2] / 2, vertices[3] / 3], axis=1)
     np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(matrix) == pytest.approx(1)
     axis = (1 if up[0] != "-" else -1) * np.eye(3)["xyz".index(up[-1])]

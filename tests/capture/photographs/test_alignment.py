@@ -40,8 +40,8 @@ def walked(turns: np.ndarray, noise: float = 0.0) -> tuple[Structure, Tracked]:
     poses[1, :, :3, 3] = WORLD.inv().apply(eyes - ORIGIN) / SCALE
     names = tuple(f"{i:02d}.jpg" for i in range(COUNT))
     lens = (from_fov(8, 6, 60.0),) * COUNT
-    found = Structure(names, poses[1], lens, np.zeros((1, 3)), 0.5)
-    return found, Tracked("poses.csv", dict(zip(names, poses[0], strict=True)))
+    reconstruction = Structure(names, poses[1], lens, np.zeros((1, 3)), 0.5)
+    return reconstruction, Tracked("poses.csv", dict(zip(names, poses[0], strict=True)))
 
 
 def all_ways() -> np.ndarray:
@@ -50,8 +50,8 @@ def all_ways() -> np.ndarray:
 
 
 def test_exact_without_noise():
-    found, tracked = walked(all_ways())
-    moved, scale = align(found, Path(), tracked)
+    reconstruction, tracked = walked(all_ways())
+    moved, scale = align(reconstruction, Path(), tracked)
     fit = scale.tracked
     assert fit.scale == pytest.approx(SCALE) and fit.photographs == COUNT
     mount = np.array(fit.camera_to_body)
@@ -65,12 +65,12 @@ def test_exact_without_noise():
 
 
 def test_noise_and_outliers_of_a_tracker():
-    found, tracked = walked(all_ways(), 0.003)
+    reconstruction, tracked = walked(all_ways(), 0.003)
     body = dict(tracked.body_to_world)
     wrong = body["07.jpg"].copy()
     wrong[:3, 3] += 0.8  # another body was taken for it
     body["07.jpg"] = wrong
-    fit = fit_tracked(found, replace(tracked, body_to_world=body))
+    fit = fit_tracked(reconstruction, replace(tracked, body_to_world=body))
     assert fit.scale == pytest.approx(SCALE, rel=3e-3)
     np.testing.assert_allclose(fit.translation, ORIGIN, atol=0.015)
     assert 0.2 < fit.residual_m < 0.35  # shows that something is wrong
@@ -78,12 +78,12 @@ def test_noise_and_outliers_of_a_tracker():
 
 def fit_changed(change) -> None:
     """Fit to the poses of other names."""
-    found, tracked = walked(all_ways())
+    reconstruction, tracked = walked(all_ways())
     names, poses = (
         list(part) for part in zip(*tracked.body_to_world.items(), strict=True)
     )
     body = dict(zip(*change(names, poses), strict=True))
-    fit_tracked(found, replace(tracked, body_to_world=body))
+    fit_tracked(reconstruction, replace(tracked, body_to_world=body))
 
 
 test_refused = refusals(
@@ -109,10 +109,10 @@ def test_poses_between_times(tmp_path):
     turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
     np.testing.assert_allclose(turn, [0, 0, 0.08], atol=1e-9)
     assert list(read_tracked(path).body_to_world) == ["a", "b", "c"]
-    for missing, given in (("time_s", times), ("file", None)):
+    for missing, frame_times in (("time_s", times), ("file", None)):
         path.write_text(HEADER.replace(f"{missing},", "") + "1,1,2,3,1,0,0,0\n")
         with pytest.raises(InputError, match=f"{path}: .*{missing}"):
-            read_tracked(path, given)
+            read_tracked(path, frame_times)
 
 
 def test_poses_of_heic_are_those_of_their_copies(tmp_path):
@@ -138,9 +138,9 @@ def test_any_up_becomes_z(up):
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, :3] = np.stack([side, -up, np.cross(side, -up)], axis=1)
     poses[1, :3, 3] = [2, 4, 4]
-    found = upright(structure(poses), 0.5).camera_to_world
-    np.testing.assert_allclose(found[:, :3, 1], [[0, 0, -1]] * 2, atol=1e-12)
-    eyes = found[:, :3, 3]
+    upright_poses = upright(structure(poses), 0.5).camera_to_world
+    np.testing.assert_allclose(upright_poses[:, :3, 1], [[0, 0, -1]] * 2, atol=1e-12)
+    eyes = upright_poses[:, :3, 3]
     np.testing.assert_allclose(eyes.sum(0), 0, atol=1e-12)
     assert np.linalg.norm(eyes[1] - eyes[0]) == pytest.approx(3)  # half of 6
-    assert np.linalg.det(found[0]) == pytest.approx(1)
+    assert np.linalg.det(upright_poses[0]) == pytest.approx(1)

@@ -59,9 +59,9 @@ class TestCorner:
         root, result = corner
         assert result.left_out == ("flat.png",) and len(result.placed) == COUNT
         poses, posed = corner_poses(), read_images(root / "out")
-        given, eyes = poses[:, :3, 3], posed.camera_to_world[:, :3, 3]
-        found, turn = aligned(eyes, given)
-        np.testing.assert_allclose(found, given, atol=0.05)
+        true_eyes, eyes = poses[:, :3, 3], posed.camera_to_world[:, :3, 3]
+        aligned_eyes, turn = aligned(eyes, true_eyes)
+        np.testing.assert_allclose(aligned_eyes, true_eyes, atol=0.05)
         assert result.error_px < 1
         assert result.cameras[0].fx == pytest.approx(CAMERA.fx, rel=0.05)
         # z points up, and the cameras are around the origin
@@ -70,14 +70,14 @@ class TestCorner:
         assert turn[2, 2] == pytest.approx(expected, abs=5e-3)
         np.testing.assert_allclose(eyes.mean(0), 0, atol=1e-9)
         # the similarity of the cameras carries the points to the corner's planes
-        centre = given.mean(0)
-        scale = np.linalg.norm(found - centre) / np.linalg.norm(eyes)
+        centre = true_eyes.mean(0)
+        scale = np.linalg.norm(aligned_eyes - centre) / np.linalg.norm(eyes)
         world = scale * posed.points @ turn.T + centre
         assert np.median(np.abs(world - [3.0, 3.0, 0.0]).min(1)) < 0.03
 
     def test_a_mask_takes_features_away_and_is_written(self, corner):
         root, result = corner
-        features = result.found.features
+        features = result.structure.features
         assert 0 < features["0.png"] < 0.75 * features["1.png"]
         masks = read_images(root / "out").masks
         np.testing.assert_array_equal(masks[0], LEFT_HALF > 0)
@@ -191,8 +191,8 @@ class TestMixedSet:
             with Image.open(staged / f"{i:02d}.jpg") as copy:
                 assert copy.getexif().get(ExifTags.Base.Orientation, 1) == 1
             shown = files.read_image(staged / f"{i:02d}.jpg").astype(float)
-            wanted = corner_photograph(poses[i], self.taken(i)[0])
-            assert np.abs(shown - wanted).mean() < 8
+            reference = corner_photograph(poses[i], self.taken(i)[0])
+            assert np.abs(shown - reference).mean() < 8
 
     def test_is_not_replaced_by_upright_copies(self, tmp_path):
         self.photographs(tmp_path / "images", 12)
@@ -204,17 +204,20 @@ class TestMixedSet:
     @pytest.mark.slow
     def test_is_placed_whole(self, tmp_path):
         pytest.importorskip("pycolmap")
-        given = self.photographs(tmp_path / "p", 16)
+        true_poses = self.photographs(tmp_path / "p", 16)
         options = PoseOptions(lens="SIMPLE_PINHOLE")
         result = estimate_poses(tmp_path / "p", tmp_path / "out", options)
         assert result.left_out == ()
         for i, camera in enumerate(result.cameras):
-            wanted = self.taken(i)[0]
-            assert (camera.width, camera.height) == (wanted.width, wanted.height)
-            assert camera.fx == pytest.approx(wanted.fx, rel=0.05)
+            true_camera = self.taken(i)[0]
+            assert (camera.width, camera.height) == (
+                true_camera.width,
+                true_camera.height,
+            )
+            assert camera.fx == pytest.approx(true_camera.fx, rel=0.05)
         posed = read_images(tmp_path / "out")
-        found, _ = aligned(posed.camera_to_world[:, :3, 3], given[:, :3, 3])
-        np.testing.assert_allclose(found, given[:, :3, 3], atol=0.05)
+        aligned_eyes, _ = aligned(posed.camera_to_world[:, :3, 3], true_poses[:, :3, 3])
+        np.testing.assert_allclose(aligned_eyes, true_poses[:, :3, 3], atol=0.05)
         assert posed.cameras == result.cameras and not posed.has_one_size
 
 
@@ -242,9 +245,9 @@ def test_many_photographs_tell_where_a_lens_sits(tmp_path):
         turn = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
         pose[:3, :2] = pose[:3, :2] @ turn
     assert placed_by(poses, tmp_path).cx == pytest.approx(LENS.cx, abs=3)
-    found = read_images(tmp_path / "out").camera_to_world
-    _, turn = aligned(found[:, :3, 3], poses[:, :3, 3])
-    cosine = ((turn @ found[:, :3, 2, None])[..., 0] * poses[:, :3, 2]).sum(1)
+    estimated_poses = read_images(tmp_path / "out").camera_to_world
+    _, turn = aligned(estimated_poses[:, :3, 3], poses[:, :3, 3])
+    cosine = ((turn @ estimated_poses[:, :3, 2, None])[..., 0] * poses[:, :3, 2]).sum(1)
     assert np.degrees(np.arccos(cosine.min())) < 2.5
 
 
@@ -262,8 +265,8 @@ def test_fisheyes_of_150_and_80_degrees_are_placed(tmp_path, focal_px):
     """EXIF data say no focal length here, which COLMAP does not find of a fisheye."""
     lens = Camera(320, 240, focal_px, focal_px, 160.0, 120.0, 0.05, is_fisheye=True)
     poses = corner_poses(10)
-    found = placed_by(poses, tmp_path, lens, "OPENCV_FISHEYE")
-    assert found.is_fisheye and found.fx == pytest.approx(focal_px, rel=0.03)
+    camera = placed_by(poses, tmp_path, lens, "OPENCV_FISHEYE")
+    assert camera.is_fisheye and camera.fx == pytest.approx(focal_px, rel=0.03)
     eyes = read_images(tmp_path / "out").camera_to_world[:, :3, 3]
     np.testing.assert_allclose(
         aligned(eyes, poses[:, :3, 3])[0], poses[:, :3, 3], atol=0.05
@@ -339,14 +342,14 @@ class TestProcess:
         assert not (tmp_path / "out").exists()
 
     def test_interrupt_ends_the_process(self, poses, tmp_path):
-        pid, seen = tmp_path / "pid", []
+        pid, calls = tmp_path / "pid", []
         code = (
             f"pathlib.Path({str(pid)!r}).write_text(str(os.getpid()))\n"
             "print('I Processed file [2/3]', flush=True)\ntime.sleep(100)\n"
         )
 
         def interrupt(*call) -> None:
-            seen.append(call)
+            calls.append(call)
             if call == ("features", 2, 3):
                 raise KeyboardInterrupt
 
@@ -354,7 +357,7 @@ class TestProcess:
             poses(code, interrupt)
         with pytest.raises(ProcessLookupError):
             os.kill(int(pid.read_text()), 0)
-        assert ("features", 0, 3) in seen
+        assert ("features", 0, 3) in calls
 
     def test_process_ends_with_its_parent(self, tmp_path):
         (tmp_path / "pycolmap.py").write_text("import time\ntime.sleep(100)\n")

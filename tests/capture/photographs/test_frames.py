@@ -31,8 +31,8 @@ class TestChoice:
     def test_has_a_limit(self):
         place = np.full((500, 16, 2), 0.05).cumsum(0) * [0, 1]
         motion = Motion(np.ones(500), place)
-        found = choose_frames(motion, FrameOptions(frames=20, baseline=0.05))
-        assert 10 <= len(found) <= 20 and found[-1] > 400
+        indices = choose_frames(motion, FrameOptions(frames=20, baseline=0.05))
+        assert 10 <= len(indices) <= 20 and indices[-1] > 400
 
     def test_a_long_film_is_looked_through_a_few_times(self, monkeypatch):
         """The choice is that of a search to the film's end, at a small part of it."""
@@ -41,15 +41,15 @@ class TestChoice:
         motion = Motion(rng.uniform(size=len(place)), place)
         looked, percentile = [], np.percentile
 
-        def counted(away: np.ndarray, *rest, **names):
+        def counted(away: np.ndarray, *arguments, **names):
             looked.append(len(away))
-            return percentile(away, *rest, **names)
+            return percentile(away, *arguments, **names)
 
         monkeypatch.setattr(np, "percentile", counted)
-        found = choose_frames(motion, FrameOptions(frames=1000, baseline=0.1))
-        assert len(found) > 100 and sum(looked) < 8 * len(place)
+        indices = choose_frames(motion, FrameOptions(frames=1000, baseline=0.1))
+        assert len(indices) > 100 and sum(looked) < 8 * len(place)
         start, near = 0, 0.0
-        for chosen in [*found, None]:
+        for chosen in [*indices, None]:
             away = np.linalg.norm(place[start:] - place[start], axis=2)
             moved = percentile(away, 75, axis=1) / 0.1
             if chosen is None:
@@ -83,25 +83,25 @@ def test_motion_and_blur_of_a_film(tmp_path):
     write_pan(tmp_path / "pan.mp4", pixels, blurred)
     path = tmp_path / "pan.mp4"
     motion = measure_motion(path, path.read_bytes())
-    found = -np.median(motion.place[..., 1], axis=1) * WIDTH
-    np.testing.assert_allclose(found, pixels.astype(int), atol=1.5)
+    shift_px = -np.median(motion.place[..., 1], axis=1) * WIDTH
+    np.testing.assert_allclose(shift_px, pixels.astype(int), atol=1.5)
     sharp = np.setdiff1d(np.arange(len(pixels)), blurred)
     least = motion.sharpness[sharp].min()
     assert motion.sharpness[list(blurred)].max() < 0.5 * least
 
 
 def test_sharp_frames_are_written_in_order(tmp_path):
-    film, folder, seen = tmp_path / "pan.mp4", tmp_path / "frames", []
+    film, folder, calls = tmp_path / "pan.mp4", tmp_path / "frames", []
     write_pan(film, 3 * np.arange(80), blurred=tuple(range(1, 80, 2)))
     folder.mkdir()
-    times = extract_frames(film, folder, progress=lambda *call: seen.append(call))
+    times = extract_frames(film, folder, progress=lambda *call: calls.append(call))
     names = list(times)
     assert sorted(path.name for path in folder.iterdir()) == names
     indices = [int(name[6:12]) for name in names]
     assert len(names) >= 10 and all(index % 2 == 0 for index in indices)
     np.testing.assert_allclose(list(times.values()), np.array(indices) / 30, atol=1e-3)
     assert files.read_image(folder / names[0]).shape == (HEIGHT, WIDTH, 3)
-    assert ("motion", 80, 80) in seen and seen[-1] == ("frames", *[len(names)] * 2)
+    assert ("motion", 80, 80) in calls and calls[-1] == ("frames", *[len(names)] * 2)
 
 
 def test_films_that_a_phone_turned_are_shown_upright():

@@ -88,8 +88,8 @@ def lying(tmp_path_factory):
 
 
 def test_scale_within_a_percent(tmp_path):
-    found, poses = photographs(tmp_path, {**LYING, **STANDING})
-    result, scale = align(found, tmp_path, Markers(EDGE_M, FAMILY))
+    reconstruction, poses = photographs(tmp_path, {**LYING, **STANDING})
+    result, scale = align(reconstruction, tmp_path, Markers(EDGE_M, FAMILY))
     assert set(scale.markers) == {3, 7, 9} and min(scale.markers.values()) >= 4
     assert scale.metres_per_unit == pytest.approx(UNIT_M, rel=0.01)
     assert scale.spread < 0.01
@@ -99,8 +99,8 @@ def test_scale_within_a_percent(tmp_path):
 
 
 def test_flat_markers_are_the_ground(lying):
-    folder, found, poses = lying
-    result, _ = align(found, folder, Markers(EDGE_M, FAMILY, flat=True))
+    folder, reconstruction, poses = lying
+    result, _ = align(reconstruction, folder, Markers(EDGE_M, FAMILY, flat=True))
     eyes = result.camera_to_world[:, :3, 3]
     np.testing.assert_allclose(eyes[:, 2], poses[:, 2, 3], atol=0.01)
     np.testing.assert_allclose(eyes[:, :2].mean(0), 0, atol=1e-9)
@@ -110,7 +110,7 @@ def test_flat_markers_are_the_ground(lying):
 
 
 def test_wrong_corners_count_little_and_doubled_markers_nothing(lying, monkeypatch):
-    folder, found, _ = lying
+    folder, reconstruction, _ = lying
     image = files.read_image(folder / "2.png")[..., 0]
     assert set(detect_markers(image, FAMILY)) == {3, 7}
     assert detect_markers(np.concatenate([image, image], axis=1), FAMILY) == {}
@@ -121,9 +121,9 @@ def test_wrong_corners_count_little_and_doubled_markers_nothing(lying, monkeypat
         return {k: c + shift for k, c in detect_markers(grey, family).items()}
 
     monkeypatch.setattr(module, "detect_markers", detect)
-    seen = find_markers(folder, found, Markers(EDGE_M, FAMILY))
+    markers = find_markers(folder, reconstruction, Markers(EDGE_M, FAMILY))
     assert list(off) == []
-    assert seen.scale(EDGE_M)[0] == pytest.approx(UNIT_M, rel=0.01)
+    assert markers.scale(EDGE_M)[0] == pytest.approx(UNIT_M, rel=0.01)
 
 
 @pytest.mark.parametrize(
@@ -134,9 +134,9 @@ def test_wrong_corners_count_little_and_doubled_markers_nothing(lying, monkeypat
     ],
 )
 def test_markers_that_do_not_fit_are_refused(tmp_path, edges, flat, message):
-    found, _ = photographs(tmp_path, {**LYING, **STANDING}, edges)
+    reconstruction, _ = photographs(tmp_path, {**LYING, **STANDING}, edges)
     with pytest.raises(InputError, match=message):
-        align(found, tmp_path, Markers(EDGE_M, FAMILY, flat=flat))
+        align(reconstruction, tmp_path, Markers(EDGE_M, FAMILY, flat=flat))
 
 
 def test_a_fisheye_sees_markers_behind_it(tmp_path, monkeypatch):
@@ -157,11 +157,13 @@ def test_a_fisheye_sees_markers_behind_it(tmp_path, monkeypatch):
         sights.append({3: 320 + local[:, :2] * (radius / across)[:, None]})
         files.write_image(tmp_path / f"{k}.png", np.zeros((4, 4, 3), np.uint8))
     names = tuple(f"{k}.png" for k in range(6))
-    found = Structure(names, np.array(poses), (camera,) * 6, np.zeros((0, 3)), 0.5)
+    reconstruction = Structure(
+        names, np.array(poses), (camera,) * 6, np.zeros((0, 3)), 0.5
+    )
     shown = iter(sights)
     monkeypatch.setattr(module, "detect_markers", lambda grey, family: next(shown))
-    seen = find_markers(tmp_path, found, Markers(EDGE_M, FAMILY))
-    np.testing.assert_allclose(seen.corners[3], corners, atol=1e-6)
+    markers = find_markers(tmp_path, reconstruction, Markers(EDGE_M, FAMILY))
+    np.testing.assert_allclose(markers.corners[3], corners, atol=1e-6)
 
 
 SCALES = [
@@ -178,9 +180,12 @@ SCALES = [
 
 @pytest.mark.parametrize(("count", "make", "message"), SCALES)
 def test_scales_that_are_none_are_refused(lying, count, make, message):
-    folder, found, _ = lying
-    parts = ("names", "camera_to_world", "cameras")
-    few = replace(found, **{part: getattr(found, part)[:count] for part in parts})
+    folder, reconstruction, _ = lying
+    fields = ("names", "camera_to_world", "cameras")
+    few = replace(
+        reconstruction,
+        **{field: getattr(reconstruction, field)[:count] for field in fields},
+    )
     with pytest.raises(InputError, match=message):
         align(few, folder, make())
 
@@ -192,9 +197,11 @@ def test_without_opencv(lying, monkeypatch):
 
 
 def test_a_distance_tells_the_scale(lying):
-    folder, found, poses = lying
+    folder, reconstruction, poses = lying
     apart = float(np.linalg.norm(poses[0, :3, 3] - poses[5, :3, 3]))
-    found = replace(found, names=("a.HEIC.jpg", *found.names[1:]))
+    reconstruction = replace(
+        reconstruction, names=("a.HEIC.jpg", *reconstruction.names[1:])
+    )
     for first in ("a.HEIC", "a.HEIC.jpg"):  # the photograph, or its copy
-        _, scale = align(found, folder, Distance(first, "5.png", apart))
+        _, scale = align(reconstruction, folder, Distance(first, "5.png", apart))
         assert scale.metres_per_unit == pytest.approx(UNIT_M)

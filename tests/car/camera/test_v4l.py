@@ -75,7 +75,7 @@ def test_only_the_newest_is_kept_and_nothing_waits(pipe, monkeypatch):
         while time.monotonic() < started + 60:
             assert camera.newest()
     pipe.send(3)  # and goes on
-    wait_for(lambda: (kept := camera._unprepared) and kept[2] == 101)
+    wait_for(lambda: (frame := camera._unprepared) and frame[2] == 101)
     pipe.file.close()
     wait_for(lambda: camera._error)
     with pytest.raises(DeviceLostError, match="no more images"):
@@ -105,11 +105,11 @@ class Device:
 
 @pytest.fixture
 def device(monkeypatch):
-    found = Device()
-    monkeypatch.setattr(v4l, "_opened", lambda *_: found)
+    stand_in = Device()
+    monkeypatch.setattr(v4l, "_opened", lambda *_: stand_in)
     monkeypatch.setattr(v4l, "time", SimpleNamespace(monotonic=lambda: 1000.0))
-    yield found
-    found.frames.put(None)
+    yield stand_in
+    stand_in.frames.put(None)
 
 
 @pytest.mark.parametrize(
@@ -140,7 +140,7 @@ def test_frames_that_nobody_asks_for_cost_nothing(device, monkeypatch):
     camera = V4lCamera("device", SMALL)
     for _ in range(50):
         device.send(999.9)
-    wait_for(lambda: (kept := camera._unprepared) and kept[2] == 49)
+    wait_for(lambda: (frame := camera._unprepared) and frame[2] == 49)
     assert newest(camera, 49) is camera.newest()
     assert len(prepared) == 1
     camera.close()

@@ -103,8 +103,8 @@ def test_files_that_say_something_wrong(tmp_path, name, text, message):
 def test_a_calibration_of_another_wheelbase_is_refused(tmp_path):
     path = tmp_path / "measured.toml"
     write_calibration(path, Calibration(timeout_ms=200, wheelbase_m=0.25))
-    given = {"calibration": str(path), "wheelbase_m": 0.25}
-    scales = read_config(None, given).scales
+    settings = {"calibration": str(path), "wheelbase_m": 0.25}
+    scales = read_config(None, settings).scales
     assert (scales.wheelbase_m, scales.timeout_ms) == (0.25, 200)
     with pytest.raises(InputError, match=r"measured\.toml: .* 0\.25 m, .* is 0\.325;"):
         assert read_config(None, {"calibration": str(path)}).scales
@@ -117,7 +117,7 @@ TOKEN = {"policy": "p.toml", "token_file": "t", "simulated": True}
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("settings", "message"),
     [
         ({"calibration": "racecar-j"}, "tracker: none; give vicon:ADDRESS"),
         (REAL | {"tracker": "replay:a.mcap"}, "replay:a.mcap: a recording does not"),
@@ -129,21 +129,21 @@ TOKEN = {"policy": "p.toml", "token_file": "t", "simulated": True}
         (FAST, "speed_ms: 3; .* holds 0.2 to 2 m/s"),
     ],
 )
-def test_drives_that_would_not_be_what_they_seem(given, message):
-    config = read_config(None, given)
+def test_drives_that_would_not_be_what_they_seem(settings, message):
+    config = read_config(None, settings)
     with pytest.raises(InputError, match=message):
         settings_of(config)
         config.check()
 
 
 def test_what_drives_a_car_or_none():
-    for given in (
+    for settings in (
         REAL,
         REAL | {"tracker": "replay:a.mcap", "on_block": True},
         {"policy": "expert", "simulated": True},
         TOKEN | {"policy": "http://10.0.0.2:8000"},
     ):
-        read_config(None, given).check()
+        read_config(None, settings).check()
     config = read_config(None, SLOW | {"simulated": True})
     assert settings_of(config).speed_ms == 0.15
 
@@ -155,7 +155,7 @@ def test_a_key_beside_its_option_is_refused(setting):
 
 
 @pytest.mark.parametrize(
-    ("given", "said", "found"),
+    ("settings", "said", "expected"),
     [
         ({}, ("rad/s", None), ("rad/s", 0.325)),
         ({}, ("rad", 0.25), ("rad", 0.25)),
@@ -165,14 +165,14 @@ def test_a_key_beside_its_option_is_refused(setting):
         ({}, (None, None), "nobody says in which unit p.onnx steers"),
     ],
 )
-def test_unit_and_wheelbase_are_those_of_the_policy(given, said, found):
-    config = read_config(None, {"policy": "p.onnx"} | given)
-    if isinstance(found, str):
-        with pytest.raises(InputError, match=found):
+def test_unit_and_wheelbase_are_those_of_the_policy(settings, said, expected):
+    config = read_config(None, {"policy": "p.onnx"} | settings)
+    if isinstance(expected, str):
+        with pytest.raises(InputError, match=expected):
             config.driven_by(*said)
     else:
         driven = config.driven_by(*said)
-        assert (driven.control_unit, driven.car.wheelbase) == found
+        assert (driven.control_unit, driven.car.wheelbase) == expected
 
 
 def test_defaults_fence_the_route_and_take_twice_the_largest_control():

@@ -61,8 +61,8 @@ def test_a_log_of_a_killed_process_lacks_half_a_second_at_most(driven, variant):
     # frames come 0.1 s apart, 0.03 s late
     assert 2.5 - 0.5 - 0.15 <= times[-1] <= 2.5 and len(times) >= 14
     assert "cut off" in recording.remarks[0]
-    whole = open_recording(folder / "drive.mcap", None, CameraMount())
-    np.testing.assert_array_equal(recording.image(3), whole.image(3))
+    complete = open_recording(folder / "drive.mcap", None, CameraMount())
+    np.testing.assert_array_equal(recording.image(3), complete.image(3))
 
 
 def test_both_clocks_are_kept(driven):
@@ -70,10 +70,13 @@ def test_both_clocks_are_kept(driven):
     folder, bench = driven
     with (folder / "drive.mcap").open("rb") as stream:
         log = reader.make_reader(stream)
-        kept = {item.name: item.metadata for item in log.iter_metadata()}
-        assert kept["drive"] == {"policy": "stand-in"}
-        wall = int(kept["clocks"]["wall_ns"])
-        assert (float(kept["clocks"]["monotonic_s"]), wall) == (bench.start_s, WALL_NS)
+        metadata = {item.name: item.metadata for item in log.iter_metadata()}
+        assert metadata["drive"] == {"policy": "stand-in"}
+        wall = int(metadata["clocks"]["wall_ns"])
+        assert (float(metadata["clocks"]["monotonic_s"]), wall) == (
+            bench.start_s,
+            WALL_NS,
+        )
         for _, channel, message in log.iter_messages(["/command", "/camera/image"]):
             since = 1e-9 * (message.log_time - wall)
             age = 1e-9 * (message.log_time - message.publish_time)

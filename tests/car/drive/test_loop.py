@@ -91,9 +91,9 @@ def check_fault(cause: Cause, moment_s: float, path: Path) -> None:
         Cause.SPEEDS_DIFFER: SPEED_S,
     }.get(cause, LONGEST_S)
     assert 0 <= since < longest, f"{cause}: braked after {since:.3f} s"
-    found = [item for item in messages(path, "/safety") if item.name == cause.value]
-    assert [item.msg for item in found] == [stop.message]
-    assert found[0].level == (20 if cause is Cause.RELEASED else 50)
+    faults = [item for item in messages(path, "/safety") if item.name == cause.value]
+    assert [item.msg for item in faults] == [stop.message]
+    assert faults[0].level == (20 if cause is Cause.RELEASED else 50)
 
 
 @pytest.mark.parametrize("cause", FAULTS)
@@ -228,9 +228,9 @@ def test_nothing_moves_before_the_enable_is_pressed_anew(
     bench.drive(path, duration_s=1.0)
     assert bench.events[0][1] == "send"
     assert bench.events[0][0] >= bench.start_s + 4.0
-    told = [item.msg for item in messages(path, "/safety")]
-    assert any(message in text for text in told)
-    assert "ready: release the enable button, then hold it" in told
+    texts = [item.msg for item in messages(path, "/safety")]
+    assert any(message in text for text in texts)
+    assert "ready: release the enable button, then hold it" in texts
 
 
 class FasterCamera(StandInCamera):
@@ -287,8 +287,8 @@ def test_a_motor_controller_that_would_not_brake_is_not_driven(
     bench.at(5.0, lambda: bench.broken.update(signal=KeyboardInterrupt()))
     stop, _ = bench.drive(path)
     assert "send" not in {what for _, what, _ in bench.events}
-    told = [item.msg for item in messages(path, "/safety")]
-    assert any(re.search(message, text) for text in told), told
+    texts = [item.msg for item in messages(path, "/safety")]
+    assert any(re.search(message, text) for text in texts), texts
     assert stop.cause is cause
 
 

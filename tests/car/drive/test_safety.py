@@ -183,11 +183,11 @@ def test_a_pilot_decides_of_the_newest_frame():
 
 def test_a_pilot_that_is_reset_forgets_the_frames_before():
     def begin():
-        seen = []
+        indices = []
 
         def control(frame):
-            seen.append(frame.index)
-            return float(len(seen))
+            indices.append(frame.index)
+            return float(len(indices))
 
         return control
 
@@ -290,7 +290,7 @@ def test_a_device_that_is_gone_holds_nothing(tmp_path):
 
 def test_a_button_that_is_held_already_is_let_go_first(pad):
     path, descriptor, time = pad
-    enable, told, steps = JoystickEnable(path, 4, lambda: time[0]), [], []
+    enable, prompts, steps = JoystickEnable(path, 4, lambda: time[0]), [], []
     os.write(descriptor, event(1, BUTTON, 4))
 
     def sleep(seconds: float) -> None:
@@ -298,8 +298,8 @@ def test_a_button_that_is_held_already_is_let_go_first(pad):
         if len(steps) in (3, 6):
             os.write(descriptor, event(int(len(steps) == 6), BUTTON, 4))
 
-    wait_for_press(enable, sleep, told.append)
-    assert len(steps) == 6 and len(told) == 1
+    wait_for_press(enable, sleep, prompts.append)
+    assert len(steps) == 6 and len(prompts) == 1
     check_held(enable)
     os.write(descriptor, event(0, BUTTON, 4))
     with pytest.raises(ReleasedError, match="let go"):

@@ -90,9 +90,9 @@ def test_a_lost_body_keeps_its_last_time():
         # seen until frame 10, then repeated, as Tracker does
         items = [scene(min(frame, 10), 1)[0], scene(frame, 2)[1]]
         stream.take(datagrams(frame, items)[0], float(frame))
-    lost, seen = stream.newest("body0"), stream.newest("body1")
-    assert lost is not None and seen is not None
-    assert (lost.time_s, seen.time_s) == (13, 20)  # three repetitions count
+    lost, visible = stream.newest("body0"), stream.newest("body1")
+    assert lost is not None and visible is not None
+    assert (lost.time_s, visible.time_s) == (13, 20)  # three repetitions count
     assert "repeats bit for bit" in stream.explain("body0")
     stream.take(datagrams(21, scene(21, 2))[0], 21.0)
     check(stream, "body0", 21)
@@ -150,7 +150,7 @@ def mutate(rng: random.Random, raw: bytes) -> bytes:
 
 @pytest.mark.parametrize("count", [6000, pytest.param(100_000, marks=pytest.mark.slow)])
 def test_damaged_datagrams_give_the_right_pose_or_none(count):
-    rng, changed, kept = random.Random(2), 0, 0
+    rng, changed, accepted = random.Random(2), 0, 0
     for number in range(count):
         size = SIZES[number % 3]
         frame = rng.randrange(1 << 32)
@@ -172,8 +172,8 @@ def test_damaged_datagrams_give_the_right_pose_or_none(count):
             turned = Rotation.from_euler("XYZ", (a, b, c)).as_matrix()
             assert pose.body_to_world[:3, :3] == pytest.approx(turned, abs=1e-9)
             assert pose.index == struct.unpack_from("<I", damaged)[0]
-            kept += 1
-    assert changed > 0.9 * count and kept > 0.3 * count
+            accepted += 1
+    assert changed > 0.9 * count and accepted > 0.3 * count
 
 
 def test_a_rotation_vector_turns_about_itself():

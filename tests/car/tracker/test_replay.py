@@ -51,11 +51,11 @@ def test_a_log_gives_all_of_its_poses(tmp_path, topic):
     messages = log_messages(tmp_path)
     schema, of_frames = messages.pop("/camera/pose")
     states = np.linspace(STATES[0], STATES[-1], 26)  # at 50 Hz, of frames at 10 Hz
-    found = mount_matrix(states, MOUNT)
+    matrices = mount_matrix(states, MOUNT)
     if topic == "/vehicle/pose":
-        found = np.stack([body(*state) for state in states])
+        matrices = np.stack([body(*state) for state in states])
     start = of_frames[0]["header"]["stamp"]["sec"]
-    poses = [pose_message(start + 0.02 * k, pose) for k, pose in enumerate(found)]
+    poses = [pose_message(start + 0.02 * k, pose) for k, pose in enumerate(matrices)]
     write_log(tmp_path / "drive.mcap", {**messages, topic: (schema, poses)})
     now = [7.0]
     words = f"replay:{tmp_path / 'drive.mcap'}"

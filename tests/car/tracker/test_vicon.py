@@ -17,16 +17,16 @@ from mi_nerfattack.errors import InputError
 
 @pytest.fixture
 def tracker():
-    found = ViconTracker(port=0)
-    yield found
-    found.close()
+    receiver = ViconTracker(port=0)
+    yield receiver
+    receiver.close()
 
 
 @pytest.fixture
 def sender(tracker):
-    found = Sender(tracker.address)
-    yield found
-    found.close()
+    transmitter = Sender(tracker.address)
+    yield transmitter
+    transmitter.close()
 
 
 def car(frame: int) -> bytes:
@@ -64,9 +64,9 @@ class Clocks:
 
 @pytest.fixture
 def clocks(monkeypatch):
-    found = Clocks()
-    monkeypatch.setattr(vicon, "time", found)
-    return found
+    stand_in = Clocks()
+    monkeypatch.setattr(vicon, "time", stand_in)
+    return stand_in
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the kernel notes no arrival")

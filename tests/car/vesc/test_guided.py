@@ -60,9 +60,9 @@ def made_arcs(*servos: float) -> list[Arc]:
 def test_arcs_tell_the_scales():
     arcs = made_arcs(CENTRE, 0.7, 0.25)
     before = Calibration(timeout_ms=200)
-    found, away_rad, spread = fit_arcs(arcs, WHEELBASE_M, before)
+    fitted, away_rad, spread = fit_arcs(arcs, WHEELBASE_M, before)
     scales = {"erpm_per_ms": 4800.0, "servo_per_rad": PER_RAD, "servo_centre": CENTRE}
-    assert found == before.changed(scales | {"wheelbase_m": WHEELBASE_M})
+    assert fitted == before.changed(scales | {"wheelbase_m": WHEELBASE_M})
     assert away_rad < 1e-9 and spread < 1e-9
     crooked = Arc(arcs[2].servo, arcs[2].steps, *end_of_arc(1.7, 0.31))
     _, away_rad, _ = fit_arcs([*arcs[:2], crooked], WHEELBASE_M, before)
@@ -92,29 +92,29 @@ def test_an_arc_is_asked_for_until_it_is_right(monkeypatch, capsys):
 
 
 def test_what_was_measured_is_kept_until_it_is_fitted(tmp_path, capsys):
-    output, kept = tmp_path / "car.toml", tmp_path / "car.toml.arcs.json"
+    output, arcs_path = tmp_path / "car.toml", tmp_path / "car.toml.arcs.json"
     arcs = dict(zip(DRIVES, made_arcs(CENTRE, 0.7, 0.25), strict=True))
     command = [*"car calibrate /dev/none --enable /dev/none -o".split(), str(output)]
     command += ["--wheelbase-m", str(WHEELBASE_M)]
-    assert read_arcs(kept) == {}
-    write_arcs(kept, {"straight": arcs["straight"]})
+    assert read_arcs(arcs_path) == {}
+    write_arcs(arcs_path, {"straight": arcs["straight"]})
     assert cli.main(command) == 2  # the others are to be driven
-    told = capsys.readouterr()
-    assert f"{kept} has straight; remove it" in told.out
-    assert "/dev/none: does not exist" in told.err
-    write_arcs(kept, dict.fromkeys(DRIVES, arcs["straight"]))
+    printed = capsys.readouterr()
+    assert f"{arcs_path} has straight; remove it" in printed.out
+    assert "/dev/none: does not exist" in printed.err
+    write_arcs(arcs_path, dict.fromkeys(DRIVES, arcs["straight"]))
     assert cli.main(command) == 2
-    assert f"; {kept} has what was measured: take out" in capsys.readouterr().err
-    assert read_arcs(kept) == dict.fromkeys(DRIVES, arcs["straight"])
-    write_arcs(kept, arcs)
+    assert f"; {arcs_path} has what was measured: take out" in capsys.readouterr().err
+    assert read_arcs(arcs_path) == dict.fromkeys(DRIVES, arcs["straight"])
+    write_arcs(arcs_path, arcs)
     assert cli.main(command) == 0
-    assert read_calibration(output).servo_per_rad == PER_RAD and not kept.exists()
-    kept.write_text('{"sideways": {}}')
+    assert read_calibration(output).servo_per_rad == PER_RAD and not arcs_path.exists()
+    arcs_path.write_text('{"sideways": {}}')
     with pytest.raises(InputError, match="sideways.*'straight', 'to the left'"):
-        read_arcs(kept)
-    write_arcs(kept, {"straight": Arc(0.5, 0, 1.5, 0.0)})
+        read_arcs(arcs_path)
+    write_arcs(arcs_path, {"straight": Arc(0.5, 0, 1.5, 0.0)})
     with pytest.raises(InputError, match="arcs.json: straight: .* in 0 steps"):
-        read_arcs(kept)
+        read_arcs(arcs_path)
 
 
 @pytest.fixture
@@ -267,19 +267,19 @@ def test_a_calibration_from_beginning_to_end(tmp_path, monkeypatch, capsys):
         arguments = ["car", "calibrate", car.port, "-o", str(output), "--speed-ms", "1"]
         arguments += ["--calibration", str(begin), "--wheelbase-m", str(WHEELBASE_M)]
         assert cli.main([*arguments, "--json"]) == 0
-    found = read_calibration(output)
-    assert found.erpm_per_ms == pytest.approx(ERPM_PER_MS, rel=0.003)
-    assert found.servo_per_rad == pytest.approx(PER_RAD, rel=0.005)
-    assert found.servo_centre == pytest.approx(CENTRE, abs=0.002)
-    assert found.wheelbase_m == WHEELBASE_M
+    calibration = read_calibration(output)
+    assert calibration.erpm_per_ms == pytest.approx(ERPM_PER_MS, rel=0.003)
+    assert calibration.servo_per_rad == pytest.approx(PER_RAD, rel=0.005)
+    assert calibration.servo_centre == pytest.approx(CENTRE, abs=0.002)
+    assert calibration.wheelbase_m == WHEELBASE_M
     assert len(person.asked) == 1 + 1 + 3 * 4
-    told, shown = capsys.readouterr()
+    printed, shown = capsys.readouterr()
     assert "Armed: without commands it brakes after 250 ms with 20 A." in shown
     assert "Braked: the enable button was let go" in shown
     assert not (tmp_path / "car.toml.arcs.json").exists()
-    told = json.loads(told)
-    assert told["calibration"] == found.model_dump(mode="json")
-    assert told["before"]["erpm_per_ms"] == 4000 and told["length_spread"] >= 0
+    document = json.loads(printed)
+    assert document["calibration"] == calibration.model_dump(mode="json")
+    assert document["before"]["erpm_per_ms"] == 4000 and document["length_spread"] >= 0
 
 
 @pytest.mark.slow

@@ -66,17 +66,19 @@ def drive_to_speed(motor: VescMotor, car: StandIn) -> None:
     wait_for(is_fast)
 
 
-def read_until(motor: VescMotor, found: Callable[[MotorValues], object]) -> MotorValues:
+def read_until(
+    motor: VescMotor, condition: Callable[[MotorValues], object]
+) -> MotorValues:
     """Read until values are as wanted."""
-    seen: list[MotorValues] = []
+    readings: list[MotorValues] = []
 
-    def is_found() -> object:
+    def is_met() -> object:
         values = motor.read()
-        seen[:] = [] if values is None else [values]
-        return values is not None and found(values)
+        readings[:] = [] if values is None else [values]
+        return values is not None and condition(values)
 
-    wait_for(is_found)
-    return seen[0]
+    wait_for(is_met)
+    return readings[0]
 
 
 def check_stopped(car: StandIn) -> None:
@@ -323,16 +325,16 @@ class LetGoError(Exception):
 
 @pytest.mark.parametrize("event", ["command 8", "timeout"])
 def test_arming_ends_as_soon_as_its_check_says_so(opened, event):
-    (car, motor), found = opened, []
+    (car, motor), events = opened, []
 
     def check() -> None:
         if any(line["event"] == event for line in car.log()):
-            found.append(event)
+            events.append(event)
             raise LetGoError
 
     with pytest.raises(LetGoError):
         motor.arm(check)
-    assert len(found) == 1  # asked no more, since nothing moves
+    assert len(events) == 1  # asked no more, since nothing moves
     with pytest.raises(InputError, match="not armed"):
         motor.send(Command(1.0, 0.0))
     car.wait_for(event="", mode="brake", speed_ms=0.0, servo=0.53)

@@ -95,14 +95,14 @@ def check_stream(payloads: list[bytes], frames: list[bytes], rng: random.Random)
     damage(broken, rng)
     raw = b"".join([*frames[:hurt], broken, *frames[hurt + 1 :]])
     decoder, cut = FrameDecoder(), rng.randrange(len(raw))
-    found = decoder.feed(raw[:cut]) + decoder.feed(raw[cut:]) + decoder.flush()
-    if found == payloads[:hurt] + payloads[hurt + 1 :]:
+    decoded = decoder.feed(raw[:cut]) + decoder.feed(raw[cut:]) + decoder.flush()
+    if decoded == payloads[:hurt] + payloads[hurt + 1 :]:
         return
-    rest = iter(payloads)
-    assert all(payload in rest for payload in found), (raw.hex(), cut)
+    remaining = iter(payloads)
+    assert all(payload in remaining for payload in decoded), (raw.hex(), cut)
     sure = payloads[:hurt] + payloads[hurt + 2 :]
-    rest = iter(found)
-    assert all(payload in rest for payload in sure), (raw.hex(), cut)
+    remaining = iter(decoded)
+    assert all(payload in remaining for payload in sure), (raw.hex(), cut)
 
 
 def check_noise(frames: list[bytes], rng: random.Random) -> None:
@@ -157,7 +157,7 @@ def whole_answer() -> bytes:
     return bytes(raw)
 
 
-WHOLE = messages.Values(
+VALUES = messages.Values(
     fet_temperature_c=-12.3,
     motor_temperature_c=45.6,
     motor_current_a=-20.5,
@@ -173,8 +173,8 @@ WHOLE = messages.Values(
 
 def test_values_by_length():
     raw = whole_answer()
-    assert messages.parse_values(raw) == WHOLE
-    assert WHOLE.has_timed_out and WHOLE.is_killed
+    assert messages.parse_values(raw) == VALUES
+    assert VALUES.has_timed_out and VALUES.is_killed
     older = messages.parse_values(raw[:73])
     assert older.status is None and older.has_timed_out is None and older.fault == 5
     assert older.is_killed is None
@@ -184,8 +184,8 @@ def test_values_by_length():
 
 def test_selected_values():
     raw = struct.pack(">BIihBB", 50, 0x00208180, 4614, 157, 0, 1)
-    found = messages.parse_values(raw)
-    assert found == messages.Values(erpm=4614, input_voltage_v=15.7, fault=0, status=1)
+    values = messages.parse_values(raw)
+    assert values == messages.Values(erpm=4614, input_voltage_v=15.7, fault=0, status=1)
 
 
 @pytest.mark.parametrize(
@@ -199,9 +199,9 @@ def test_selected_values():
     ],
 )
 def test_a_current_that_brakes(before_a, after_a, braked):
-    seen = [messages.Values(motor_current_a=value, status=0) for value in before_a]
-    seen.append(messages.Values(motor_current_a=after_a, status=1))
-    assert timeout._is_braked(seen, 20.0) is braked
+    readings = [messages.Values(motor_current_a=value, status=0) for value in before_a]
+    readings.append(messages.Values(motor_current_a=after_a, status=1))
+    assert timeout._is_braked(readings, 20.0) is braked
 
 
 def test_faults_have_names():
@@ -210,12 +210,12 @@ def test_faults_have_names():
 
 
 def test_firmware_that_is_too_old_is_refused():
-    rest = b"410\0" + bytes(14)
-    firmware = messages.parse_firmware(b"\0\x06\x05" + rest)
+    tail = b"410\0" + bytes(14)
+    firmware = messages.parse_firmware(b"\0\x06\x05" + tail)
     assert firmware == messages.Firmware(6, 5, "410") and "6.05" in str(firmware)
     assert messages.parse_firmware(b"\0\x03\x28").minor == 40
     with pytest.raises(InputError, match=r"firmware 3\.39 on 410; .*update it"):
-        messages.parse_firmware(b"\0\x03\x27" + rest)
+        messages.parse_firmware(b"\0\x03\x27" + tail)
     with pytest.raises(InputError, match=r"cut short \(00 05\)"):
         messages.parse_firmware(b"\0\x05")
 
@@ -240,11 +240,11 @@ def test_what_is_sent_is_within_the_limits(speed, steering, gain):
     erpm, servo = calibration.encode(Command(speed, steering))
     assert erpm == 0 or 900 <= abs(erpm) <= 9228
     assert 201 <= servo <= 799
-    told = calibration.decode(erpm, servo)
+    decoded = calibration.decode(erpm, servo)
     if 0.196 < abs(speed) < 2:
-        assert abs(told.speed_ms - speed) <= 0.5 / 4614 + 1e-12
+        assert abs(decoded.speed_ms - speed) <= 0.5 / 4614 + 1e-12
     if abs(steering) < 0.25:
-        assert abs(told.steering_rad - steering) <= 0.0005 / abs(gain) + 1e-12
+        assert abs(decoded.steering_rad - steering) <= 0.0005 / abs(gain) + 1e-12
 
 
 def test_the_file_keeps_every_value(tmp_path):

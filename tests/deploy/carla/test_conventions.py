@@ -73,9 +73,9 @@ def test_matrices_are_those_of_the_client_mirrored(carla, pose):
     mirror = np.diag([1.0, -1.0, 1.0, 1.0])
     expected = mirror @ np.array(transform.get_matrix()) @ mirror
     # the client computes in 32 bits: 1000 m to 0.1 mm, angles to 1e-5
-    found = conventions.body_from_carla(pose)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-4)
-    np.testing.assert_allclose(found[:3, :3], expected[:3, :3], rtol=0, atol=2e-5)
+    matrix = conventions.body_from_carla(pose)
+    np.testing.assert_allclose(matrix, expected, rtol=0, atol=2e-4)
+    np.testing.assert_allclose(matrix[:3, :3], expected[:3, :3], rtol=0, atol=2e-5)
 
 
 @pytest.mark.parametrize(
@@ -92,8 +92,8 @@ def test_depth_codes(rgb, distance):
     assert conventions.decode_depth(pixel)[0, 0] == pytest.approx(distance, rel=1e-12)
 
 
-def lens(*numbers, **more):
-    return lambda: conventions.field_of_view_deg(Camera(8, 6, *numbers, **more))
+def lens(*numbers, **distortion):
+    return lambda: conventions.field_of_view_deg(Camera(8, 6, *numbers, **distortion))
 
 
 test_cameras_that_carla_has_not_are_refused = refusals(

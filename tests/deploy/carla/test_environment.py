@@ -39,10 +39,10 @@ def kinematic() -> KinematicDriver:
     return KinematicDriver(KinematicVehicle(Motion(Dubins()), PERIOD, 1.5))
 
 
-def make(server: Server, driver=None, where=None, **more) -> CarlaEnvironment:
+def make(server: Server, driver=None, where=None, **options) -> CarlaEnvironment:
     where, driver = where or CarlaServer(timeout_s=0.2), driver or kinematic()
     return CarlaEnvironment(
-        where, CAMERA, CameraMount(), driver, api=server.api(), **more
+        where, CAMERA, CameraMount(), driver, api=server.api(), **options
     )
 
 
@@ -157,7 +157,7 @@ def test_faults_of_a_drive_give_the_world_back(fault, error, message):
         environment.reset(STRAIGHT)
 
 
-def drive(where=None, first=None, **more):
+def drive(where=None, first=None, **options):
     """Reset in a world with a fault, which must be as it was before."""
 
     def call():
@@ -165,7 +165,7 @@ def drive(where=None, first=None, **more):
         vars(server).update(first or {})
         try:
             place = CarlaServer(timeout_s=0.2, **where or {})
-            make(server, where=place, **more).reset(STRAIGHT)
+            make(server, where=place, **options).reset(STRAIGHT)
         finally:
             server.answers = True
             assert server.is_as_before
@@ -181,10 +181,10 @@ def gone():
 
 
 def motorcycle():
-    whole = stand_in.Vehicle.get_physics_control
+    get_physics_control = stand_in.Vehicle.get_physics_control
 
     def two(self):
-        control = whole(self)
+        control = get_physics_control(self)
         del control.wheels[2:]
         return control
 

@@ -171,8 +171,8 @@ def test_wheels_meet_in_one_point(car):
     turn(vehicle, 0.9 * car.max_steer, 20)
     expected = ackermann_angles(car, vehicle.state[4])
     for name, angle in zip(mjcf_car.WHEELS[:2], expected, strict=True):
-        found = vehicle._data.joint(f"{name}_steer").qpos[0]
-        assert found == pytest.approx(float(angle), rel=0.01)
+        joint_angle = vehicle._data.joint(f"{name}_steer").qpos[0]
+        assert joint_angle == pytest.approx(float(angle), rel=0.01)
     left, right = (car.wheelbase / math.tan(float(angle)) for angle in expected)
     # the axes of both front wheels cross the rear axle's line at the same distance
     assert right - left == pytest.approx(car.track, rel=1e-9)

@@ -40,10 +40,10 @@ def placed(*translate, scale=1.0, turn=(0, 0, 1, 0)):
 def scene(*shapes, **emitters):
     """Load a scene of shapes, lit by a constant sky of radiance 0.5 unless told."""
     emitters = emitters or {"sky": {"type": "constant", "radiance": 0.5}}
-    parts = {f"shape_{i}": shape for i, shape in enumerate(shapes)}
+    named_shapes = {f"shape_{i}": shape for i, shape in enumerate(shapes)}
     integrator = {"type": "path", "max_depth": 2}
     return mi.load_dict(
-        {"type": "scene", "integrator": integrator, **parts, **emitters}
+        {"type": "scene", "integrator": integrator, **named_shapes, **emitters}
     )
 
 

@@ -132,8 +132,8 @@ def test_a_log_that_is_cut_off_is_read_up_to_there(tmp_path):
             assert error.where == str(path) and not counts
             continue
         counts.append(len(recording.track.times))
-        whole, of = map(int, re.findall("[0-9]+", recording.remarks[0])[:2])
-        assert of == size and size - 1300 < whole <= size  # a definition is the longest
+        end, of = map(int, re.findall("[0-9]+", recording.remarks[0])[:2])
+        assert of == size and size - 1300 < end <= size  # a definition is the longest
         assert len(recording.remarks) == (1 if counts[-1] == COUNT else 2)
     assert counts == sorted(counts) and set(counts) >= {1, COUNT}
 

@@ -68,8 +68,8 @@ def test_a_recording_is_shown_frame_by_frame(tmp_path, write, tolerance):
     frame = environment.reset(ROUTE, np.array([5.0, 5.0, 1.0]), seed=7)
     for index in range(COUNT):
         middle = frame.image[:, [1, 14]].astype(int)  # away from the edge of colours
-        wanted = image_of(index)[:, [1, 14]].astype(int)
-        assert abs(middle - wanted).max() <= tolerance
+        expected = image_of(index)[:, [1, 14]].astype(int)
+        assert abs(middle - expected).max() <= tolerance
         assert frame.image.dtype == np.uint8 and frame.depth.dtype == np.float32
         assert np.isposinf(frame.depth).all() and frame.depth.shape == (8, 16)
         np.testing.assert_allclose(frame.camera_to_world, POSES[index], atol=exact)
@@ -90,13 +90,13 @@ def test_frames_are_picked_by_the_period(tmp_path):
     write_csv_folder(tmp_path / "frames", rows=csv_rows(0.05))
     environment = replay(tmp_path / "frames", period=0.15)
     environment.reset(ROUTE)
-    seen = [environment.state[0]]
+    positions = [environment.state[0]]
     while not environment.is_over:
         environment.step(0.0)
-        seen.append(environment.state[0])
+        positions.append(environment.state[0])
     # recorded every 0.05 s up to 0.25 s, shown at 0, 0.15 and 0.3 s: every third
     # frame, and at last the one nearest to 0.3 s
-    np.testing.assert_allclose(seen, [0.0, 1.5, 2.5])
+    np.testing.assert_allclose(positions, [0.0, 1.5, 2.5])
 
 
 @pytest.mark.parametrize(("with_depth", "is_seen"), [(True, False), (False, True)])
@@ -169,8 +169,8 @@ def test_a_log_of_somebody_else(tmp_path):
 
 
 def test_frames_that_a_cut_keeps_but_hides_do_not_count(tmp_path):
-    whole, path = write_drive_video(tmp_path, table=False), tmp_path / "cut.mp4"
-    with av.open(str(whole)) as source, av.open(str(path), "w") as target:
+    video, path = write_drive_video(tmp_path, table=False), tmp_path / "cut.mp4"
+    with av.open(str(video)) as source, av.open(str(path), "w") as target:
         stream = source.streams.video[0]
         copy = target.add_stream_from_template(stream)
         start = int(0.2 / stream.time_base)  # from here on, as `ffmpeg -ss 0.2 -c copy`
@@ -184,8 +184,8 @@ def test_frames_that_a_cut_keeps_but_hides_do_not_count(tmp_path):
     recording = open_recording(path, CAMERA, MOUNT)
     np.testing.assert_allclose(recording.track.times, 0.1 * np.arange(COUNT - 2))
     for index in range(COUNT - 2):
-        wanted = image_of(index + 2)[:, 1].astype(int)
-        assert abs(recording.image(index)[:, 1] - wanted).max() <= 6
+        expected = image_of(index + 2)[:, 1].astype(int)
+        assert abs(recording.image(index)[:, 1] - expected).max() <= 6
 
 
 def test_one_late_frame_does_not_refuse_a_log(tmp_path):

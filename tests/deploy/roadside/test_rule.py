@@ -56,11 +56,11 @@ class Judge:
     def findings(self, fields: Sequence[GridField], poses: Sequence[Pose]) -> list[str]:
         pairs = enumerate(zip(fields, poses, strict=True))
         solids = [Solid.of(f"{i}", PosedField(*pair)) for i, pair in pairs]
-        found = list(meeting_findings(solids))
+        issues = list(meeting_findings(solids))
         for route in self.around.routes:  # as if a car were as wide as the lane
-            found += lane_findings(solids, route, route.lane_width_m, Freedom())
+            issues += lane_findings(solids, route, route.lane_width_m, Freedom())
         scene = self.around.scene
-        return found + list(scene_findings(solids, self.route, scene, "scene"))
+        return issues + list(scene_findings(solids, self.route, scene, "scene"))
 
     def seconds(self, fields: Sequence[GridField], poses: Sequence[Pose], px: int):
         """Return how long each object shows at least so many pixels, seconds."""
@@ -276,8 +276,8 @@ def test_scales_belong_to_kinds_and_lanes_of_all_routes_stay_free():
 def test_many_find_some_room(rng):
     """On 4.25 m beside the lane there is room for some boxes 2 m wide, not for 16."""
     around, boxes = surroundings(straight(), scene=narrow()), [solid_box(2, 2, 1)] * 16
-    found = Roadside().find(boxes, around, straight(), (0.0, 6.0), rng)
-    assert 0 < sum(pose is not None for pose in found) < 16
+    poses = Roadside().find(boxes, around, straight(), (0.0, 6.0), rng)
+    assert 0 < sum(pose is not None for pose in poses) < 16
 
 
 def empty() -> GridField:

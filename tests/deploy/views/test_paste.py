@@ -63,27 +63,27 @@ def rolled(pose: np.ndarray, angle: float) -> np.ndarray:
 def test_near_box_covers_what_lies_behind(wall, angle):
     density, raw = 30.0, 0.4
     pose = rolled(look_at((-4.0, 0.7, 0.3), (0.0, 0.2, 0.0)), angle)
-    found = pasted(wall, posed(density, raw), pose=pose)
+    frame = pasted(wall, posed(density, raw), pose=pose)
     near, far = box_interval(pose)
     inside, outside = far - near > 0.2, far - near < 0
     assert inside.sum() > 20 and outside.sum() > 20
     linear = sigmoid_to_linear(np.array(raw))
     level = 255 * (1.055 * linear ** (1 / 2.4) - 0.055)
-    assert abs(found.image[inside].astype(float) - level).max() <= 1.0
-    assert (found.image[outside] == GREY).all()
-    assert (found.depth[outside] == np.float32(wall)).all()
+    assert abs(frame.image[inside].astype(float) - level).max() <= 1.0
+    assert (frame.image[outside] == GREY).all()
+    assert (frame.depth[outside] == np.float32(wall)).all()
     length, passed = far - near, np.exp(-density * (far - near))
     expected = near + 1 / density - length * passed / (1 - passed)
-    assert abs(found.depth - expected)[inside].max() < 2e-3
-    assert found.depth.dtype == np.float32 and found.image.dtype == np.uint8
+    assert abs(frame.depth - expected)[inside].max() < 2e-3
+    assert frame.depth.dtype == np.float32 and frame.image.dtype == np.uint8
 
 
 @pytest.mark.parametrize(("length", "is_pasted"), [(0.6, False), (0.8, True)])
 def test_half_opacity_decides_and_walls_hide(length, is_pasted):
     # 1 - exp(-x) passes one half at x = 0.69; along the axis the box is 2 m thick
     pose = look_at((-4.0, 1e-3, 1e-3), (0.0, 1e-3, 1e-3))
-    found = pasted(np.inf, posed(length / 2), pose=pose)
-    assert np.isfinite(found.depth[5:7, 7:9]).all() == is_pasted
+    frame = pasted(np.inf, posed(length / 2), pose=pose)
+    assert np.isfinite(frame.depth[5:7, 7:9]).all() == is_pasted
     behind = look_at((4.0, 0.0, 0.0), (8.0, 0.0, 0.0))
     for at in (pose, behind):
         hidden = pasted(2.0, posed(30.0), pose=at)
@@ -95,21 +95,21 @@ def test_walls_among_objects(order):
     """Near: thin, so that half of a ray passes it. Far: behind the wall at 7 m."""
     near, far = posed(0.25, 3.0, -4.0, 0.5), posed(60, -3.0, 2.0, 2.0)
     for items in ([near], [far], [near, far][::order]):
-        found = pasted(7.0, *items)
-        assert (found.image == GREY).all() and (found.depth == 7.0).all()
+        frame = pasted(7.0, *items)
+        assert (frame.image == GREY).all() and (frame.depth == 7.0).all()
     dark = posed(60, -3.0, -3.0, 0.5)
-    found = pasted(np.inf, *[posed(60, 3.0), dark][::order])
-    assert found.image[6, 8].max() < 100  # the nearer one is on top
-    assert found.depth[6, 8] == pytest.approx(4.5, abs=0.05)
+    frame = pasted(np.inf, *[posed(60, 3.0), dark][::order])
+    assert frame.image[6, 8].max() < 100  # the nearer one is on top
+    assert frame.depth[6, 8] == pytest.approx(4.5, abs=0.05)
 
 
 def test_wall_between_two_objects_hides_the_farther_alone():
     near, far = posed(2.0, 3.0, -4.0, 0.5), posed(60, -3.0, 2.0, 2.0)
     alone = pasted(7.0, near)
     assert (alone.depth < 7).sum() > 3
-    found = pasted(7.0, far, near)
-    assert (found.image == alone.image).all() and (found.depth == alone.depth).all()
-    layers = found.layers(["far", "near"])
+    frame = pasted(7.0, far, near)
+    assert (frame.image == alone.image).all() and (frame.depth == alone.depth).all()
+    layers = frame.layers(["far", "near"])
     assert not layers["far"].any() and np.isinf(layers["far.Z"]).all()
     assert layers["near"][..., 3].sum() == (alone.depth < 7).sum()
     total = sum(layers[name] for name in ("scene", "far", "near"))

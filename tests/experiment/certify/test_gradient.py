@@ -174,9 +174,9 @@ def test_objectives_end_with_the_horizon():
     weights = np.array([1.0, 2, 3, 4, 5, 6])
     weighted, end = StageSum(square, weights), Terminal(square)
     both = WeightedSum(((2.0, weighted), (1.0, end)))
-    found = truncated(both, 4).costs(states[:, :4], 0.1)
+    costs = truncated(both, 4).costs(states[:, :4], 0.1)
     expected = 2 * (weights[:4] * values[:, :4]).sum(1) + values[:, 3]
-    assert found == pytest.approx(expected, rel=1e-5)
+    assert costs == pytest.approx(expected, rel=1e-5)
 
 
 def test_the_chart_has_slopes_cosines_and_changes(certified, monkeypatch):

@@ -51,27 +51,27 @@ def test_the_direction_is_the_normal_of_a_half_space():
     rng = np.random.default_rng(0)
     normal = rng.standard_normal(24)
     noise = 0.5 * rng.standard_normal((4000, 24))
-    found = steepest(noise, (noise @ normal > 1.0).astype(float))
-    assert np.linalg.norm(found) == pytest.approx(1)
-    assert found @ normal / np.linalg.norm(normal) > 0.95
+    direction = steepest(noise, (noise @ normal > 1.0).astype(float))
+    assert np.linalg.norm(direction) == pytest.approx(1)
+    assert direction @ normal / np.linalg.norm(normal) > 0.95
     assert not steepest(noise, np.full(4000, 0.3)).any()
 
 
 def test_a_search_stays_in_its_ball_and_finds_its_farthest_point():
-    wanted, asked = np.ones(6) / np.sqrt(6), []
+    direction, asked = np.ones(6) / np.sqrt(6), []
 
     def judge(point: np.ndarray) -> float:
         asked.append(point)
-        return float(point @ wanted)
+        return float(point @ direction)
 
     search = BallSearch(0.7, np.zeros(6), 200, seed=1)
-    found = search.best(judge)
+    farthest = search.best(judge)
     assert len(asked) == 200 and np.array_equal(asked[0], np.zeros(6))
     assert max(np.linalg.norm(point) for point in asked) <= 0.7 + 1e-12
-    assert found @ wanted > 0.95 * 0.7
-    assert found @ wanted == max(point @ wanted for point in asked)
+    assert farthest @ direction > 0.95 * 0.7
+    assert farthest @ direction == max(point @ direction for point in asked)
     again, first = list(asked), asked.clear()
-    assert first is None and np.array_equal(search.best(judge), found)
+    assert first is None and np.array_equal(search.best(judge), farthest)
     assert np.array_equal(again, asked)
     assert into_ball(np.array([3.0, 4.0]), 1.0) == pytest.approx([0.6, 0.8])
 
@@ -130,10 +130,10 @@ def test_finished_drives_are_kept_and_more_are_added(scenario, certified):
     again = certify_robustness(scenario, output, SETTINGS, InThisProcess())
     assert again == document
     assert {p: p.stat().st_mtime_ns for p in output.rglob("*.safetensors")} == before
-    more = RobustnessSettings(**{**vars(SETTINGS), "runs": 14, "radii": (0.3,)})
-    wider = certify_robustness(scenario, output, more, InThisProcess())
-    kept = {p: p.stat().st_mtime_ns for p in output.rglob("random_*.safetensors")}
-    assert len(kept) == 14 and sum(before.get(p) == at for p, at in kept.items()) == 12
+    settings = RobustnessSettings(**{**vars(SETTINGS), "runs": 14, "radii": (0.3,)})
+    wider = certify_robustness(scenario, output, settings, InThisProcess())
+    runs = {p: p.stat().st_mtime_ns for p in output.rglob("random_*.safetensors")}
+    assert len(runs) == 14 and sum(before.get(p) == at for p, at in runs.items()) == 12
     assert wider["departed"] >= document["departed"]
     # two numbers of runs are two looks, which lessen the confidence
     assert document["looks"] == again["looks"] == [12] and document["flags"] == []
@@ -172,12 +172,12 @@ def test_without_noise_it_is_the_drive_past_the_original_texture(scenario, tmp_p
     looks = Looks(world, 24)
     smoothing = Smoothing.of(world, "surrogate", looks, 0.5)
     zero, draw = np.zeros(looks.count), smoothing.nominal(world, 1)
-    here = world, looks
+    world_looks = world, looks
     specs = [
         smoothing.spec(zero, draw, "random", 0),
         smoothing.spec(zero, smoothing.draw(world, CENTRE, 0), "random", 0),
     ]
-    work = NoisyDrives(Store(tmp_path), scenario, 24, specs, here)
+    work = NoisyDrives(Store(tmp_path), scenario, 24, specs, world_looks)
     driver, where = work.open(), (world.policy, world.route, world.initial[1])
     with one_thread():
         environment = world.open("surrogate")

@@ -93,10 +93,10 @@ def test_a_transfer_leaves_a_table_of_which_its_page_is_written_again(tmp_path):
 
 @pytest.mark.parametrize("left", ["no_object", "attack"])
 def test_a_case_that_is_not_driven_leaves_its_cells_empty(left, tmp_path):
-    found = document("b")
-    for row in found["rows"]:
+    transfer = document("b")
+    for row in transfer["rows"]:
         row["cases"] = {k: v for k, v in row["cases"].items() if k != left}
-    files.write_json(tmp_path / "transfer.json", found)
+    files.write_json(tmp_path / "transfer.json", transfer)
     page = tmp_path / "README.md"
     assert cli.main(["report", str(tmp_path), "-o", str(page)]) == 0
     cells = "|  | 0.400 | 1 of 1 |" if left == "no_object" else "| 0.400 |  |  |"
@@ -124,8 +124,8 @@ def test_the_committed_rows_can_be_repeated():
 @pytest.mark.parametrize("folder", [TABLE2, METHODS])
 def test_the_committed_summary_is_that_of_the_committed_table(folder):
     drives = read_table(folder / RESULTS)
-    found = summarise(drives, read_attacks(folder, drives))
-    assert digits(found) == digits(files.read_json(folder / SUMMARY))
+    summary = summarise(drives, read_attacks(folder, drives))
+    assert digits(summary) == digits(files.read_json(folder / SUMMARY))
 
 
 @pytest.mark.parametrize("folder", [TABLE2, METHODS, DOCS / "results/matrix"])

@@ -17,7 +17,7 @@ from mi_nerfattack import cli
 from mi_nerfattack.experiment.page.run import read_run
 from mi_nerfattack.experiment.page.write import _settings, write_page
 from mi_nerfattack.io import files
-from mi_nerfattack.report.pages.elements import SEEN, Parts, RunPart
+from mi_nerfattack.report.pages.elements import FRAMES, PageContents, RunPart
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -48,8 +48,8 @@ def test_a_run_is_on_one_page(tmp_path):
     shutil.rmtree(tmp_path / "run" / "frames" / "surrogate_random")
     shares = {"ball": [0.1, 0.1, 0.3, -0.2], "cone": [0.2, 0.1, 0.3, 0.1]}
     files.write_json(tmp_path / "run/attribution.json", {"gradient_share": shares})
-    parts = Parts(runs=[read_run(tmp_path / "run", "run")])
-    write_page(tmp_path / "page.html", parts, tmp_path)
+    contents = PageContents(runs=[read_run(tmp_path / "run", "run")])
+    write_page(tmp_path / "page.html", contents, tmp_path)
     page = files.read_text(tmp_path / "page.html")
     reader = PageReader(page)
     reader.check_alone()
@@ -93,7 +93,7 @@ def test_without_an_attribution_the_slider_begins_where_frames_differ(tmp_path, 
     shutil.copy(
         frames / "surrogate_attack/0003.png", frames / "surrogate_attack/0001.png"
     )
-    (scrubber,) = read_run(tmp_path / "run", "run").scrubbers[SEEN]
+    (scrubber,) = read_run(tmp_path / "run", "run").scrubbers[FRAMES]
     assert scrubber.start == 1
 
 
@@ -186,38 +186,36 @@ def test_objectives_stand_in_the_line_of_a_run(tmp_path, page_of):
 
 
 def test_files_of_a_scenario_count_by_their_checksums():
-    def run(label, digest, file, **more_of_the_object):
+    def run(label, digest, file, **object_keys):
         scenario = {"policy": {"file": file}, "name": label}
-        scenario["objects"] = [
-            {"field": f"{label}/o.safetensors", **more_of_the_object}
-        ]
+        scenario["objects"] = [{"field": f"{label}/o.safetensors", **object_keys}]
         digests = {f"policy.file: {file}": digest, "objects[0].field: o": "o"}
-        more = {"pictures": {}, "scrubbers": {}, "missing": {}, "repeat": ""}
-        about = {"scenario": "", "made_with": {}, "digests": digests}
-        return RunPart(label, {"scenario": scenario}, **about, **more)
+        contents = {"pictures": {}, "scrubbers": {}, "missing": {}, "repeat": ""}
+        provenance = {"scenario": "", "made_with": {}, "digests": digests}
+        return RunPart(label, {"scenario": scenario}, **provenance, **contents)
 
     runs = [run("x", "1", "a.pt2"), run("y", "2", "a.pt2"), run("z", "1", "b.pt2")]
     assert grouped(runs) == [["x", "z"], ["y"]]
     # Older runs do not say that an object is a file; its place counts
-    older, here, there = (
+    older, newer, turned = (
         run("old", "1", "a.pt2"),
         run("here", "1", "a.pt2", kind="field"),
         run("there", "1", "a.pt2", kind="field", yaw_deg=9.0),
     )
-    assert grouped([older, here, there]) == [["old", "here"], ["there"]]
+    assert grouped([older, newer, turned]) == [["old", "here"], ["there"]]
 
 
 def grouped(runs, deployed=True):
-    found = _settings(Parts(runs=runs), deployed)
-    return [[run.label for run in own] for own in found.values()]
+    groups = _settings(PageContents(runs=runs), deployed)
+    return [[run.label for run in own] for own in groups.values()]
 
 
 def test_deployments_part_what_was_measured_in_them():
     def run(label, kind):
         scenario = {"name": label, "deployment": [{"kind": kind}]}
-        more = {"pictures": {}, "scrubbers": {}, "missing": {}, "repeat": ""}
-        about = {"scenario": "", "made_with": {}, "digests": {}}
-        return RunPart(label, {"scenario": scenario}, **about, **more)
+        contents = {"pictures": {}, "scrubbers": {}, "missing": {}, "repeat": ""}
+        provenance = {"scenario": "", "made_with": {}, "digests": {}}
+        return RunPart(label, {"scenario": scenario}, **provenance, **contents)
 
     runs = [run("a", "mitsuba"), run("b", "mujoco")]
     assert grouped(runs) == [["a"], ["b"]]

@@ -54,7 +54,7 @@ SHIFT = np.array([0.5, 0.2, 0.0, 0.0, 0.0, 0.7])
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory) -> tuple[FoundAttack, ...]:
+def attacks(tmp_path_factory) -> tuple[FoundAttack, ...]:
     """Two attacks on one object: here, and 17 m on, shifted and turned."""
     mi.set_variant("llvm_ad_rgb")
     folder = attack_jobs.write_scenario(tmp_path_factory.mktemp("scenario"), CHANGES)
@@ -76,52 +76,56 @@ def found(tmp_path_factory) -> tuple[FoundAttack, ...]:
 def read(path: Path, run: Path, offset: np.ndarray, number: int) -> FoundAttack:
     scenario, _ = load_scenario(path)
     route = driven_route(scenario, scenario.vehicle.motion())
-    rest = offset[None], None, scenario.identity(), f"digest {number}", {}
-    return FoundAttack(run, run.name, scenario, route, *rest)
+    outcome = offset[None], None, scenario.identity(), f"digest {number}", {}
+    return FoundAttack(run, run.name, scenario, route, *outcome)
 
 
-def take(found, folder: Path, frames: int = 96) -> PaintedSite:
+def take(attacks, folder: Path, frames: int = 96) -> PaintedSite:
     site, settings = PaintedSite(), small(frames=frames, margin_m=0.0)
-    routes, staging, here = [found[0].route], AmongFound(tuple(found)), InThisProcess()
-    collect(site, routes, Scattered(), settings, folder, here, staging=staging)
+    routes, staging, workers = (
+        [attacks[0].route],
+        AmongFound(tuple(attacks)),
+        InThisProcess(),
+    )
+    collect(site, routes, Scattered(), settings, folder, workers, staging=staging)
     return site
 
 
-def test_a_shard_shows_one_runs_objects_where_its_attack_left_them(found, tmp_path):
-    site = take(found, tmp_path)
-    objects = [items for item in site.opened for items in item.seen]
+def test_a_shard_shows_one_runs_objects_where_its_attack_left_them(attacks, tmp_path):
+    site = take(attacks, tmp_path)
+    objects = [items for item in site.opened for items in item.shown]
     states = [state for item in site.opened for state in item.states]
     assert len(objects) == len(states) == 96
     frames = nf.frames(tmp_path)  # as those of train
     poses = np.stack([frames[row].pose.numpy() for row in range(96)])
     np.testing.assert_array_equal(poses, states)
-    assert frames.routes == (found[0].route.name,)
-    seen = set()
+    assert frames.routes == (attacks[0].route.name,)
+    numbers = set()
     for (posed,), state in zip(objects, states, strict=True):
         number = int(posed.pose.translation[0] == 12)
-        run, pose = found[number], posed.placed
+        run, pose = attacks[number], posed.placed
         item = run.scenario.objects[0]
         moved = np.array(item.position_m) + run.offsets[0, :3]
         np.testing.assert_allclose(pose.translation, moved)
         assert pose.scale == item.scale
         turn = np.arctan2(pose.rotation[1, 0], pose.rotation[0, 0])
         assert turn == pytest.approx(run.offsets[0, 5])
-        kept = load_grid(run.folder / "objects" / "ball.safetensors")
+        grid = load_grid(run.folder / "objects" / "ball.safetensors")
         assert isinstance(posed.field, GridField)
-        np.testing.assert_array_equal(posed.field.texture.numpy(), kept.texture.numpy())
+        np.testing.assert_array_equal(posed.field.texture.numpy(), grid.texture.numpy())
         # from the drive's start to where it passes the object
         assert run.route.pose_at(0.0)[0] - 1e-6 <= state[0] <= moved[0] + 1e-6
-        seen.add(number)
-    assert seen == {0, 1}
+        numbers.add(number)
+    assert numbers == {0, 1}
 
 
-def test_frames_are_those_of_the_attack(found):
+def test_frames_are_those_of_the_attack(attacks):
     """A vehicle of the collection sees what it sees in a drive of the run."""
-    place = found_place(found)
+    place = found_place(attacks)
     for name in ("surrogate", "mitsuba"):
         site = PlaceSite(name, place, Weather(spp=1))
         taken = site.open(site.typical())
-        for run in found:
+        for run in attacks:
             x = run.scenario.objects[0].position_m[0]
             pose = run.route.pose_at(x - run.route.points[0, 0] - 6.0)
             empty = taken_image(taken, run, pose, [])
@@ -147,14 +151,14 @@ def steer(image, goal, step):
 """
 
 
-def test_an_attacked_policy_of_any_kind_drives_as_in_a_drive(found, tmp_path):
+def test_an_attacked_policy_of_any_kind_drives_as_in_a_drive(attacks, tmp_path):
     """One that remembers, too; the expert labels what it sees."""
     (tmp_path / "mine.py").write_text(REMEMBERS)
     keys = {"kind": "callable", "file": "mine.py:steer", "trust_code": True}
     section = read_section("policy", PolicySection, keys, tmp_path)
-    source, run = attacked_drives(section, found_place(found).rig), found[0]
+    source, run = attacked_drives(section, found_place(attacks).rig), attacks[0]
     assert source.describe()["policy"]["kind"] == "callable"
-    site = PlaceSite("surrogate", found_place(found))
+    site = PlaceSite("surrogate", found_place(attacks))
     pose, expert = run.route.pose_at(2.0, 0.3), expert_of(site, run.route)
     environment = site.open(site.typical())
     driven = drive(environment, section.build(), run.route, pose, 0, 9)
@@ -170,22 +174,22 @@ def test_an_attacked_policy_of_any_kind_drives_as_in_a_drive(found, tmp_path):
         assert frame.control == pytest.approx(expert.control(frame.pose)[0])
 
 
-def test_frames_among_other_attacks_are_refused(found, tmp_path):
-    take(found, tmp_path, frames=12)
-    other = dataclasses.replace(found[0], digest="another")
-    for attacks in (found[:1], [other, found[1]]):
+def test_frames_among_other_attacks_are_refused(attacks, tmp_path):
+    take(attacks, tmp_path, frames=12)
+    other = dataclasses.replace(attacks[0], digest="another")
+    for changed in (attacks[:1], [other, attacks[1]]):
         with pytest.raises(InputError, match=r"  staging.found"):
-            take(attacks, tmp_path, frames=12)
+            take(changed, tmp_path, frames=12)
 
 
-def test_runs_of_other_places_are_refused(found, tmp_path):
+def test_runs_of_other_places_are_refused(attacks, tmp_path):
     path = tmp_path / "scenario.toml"
-    shutil.copytree(found[0].folder.parent, tmp_path, dirs_exist_ok=True)
+    shutil.copytree(attacks[0].folder.parent, tmp_path, dirs_exist_ok=True)
     text = path.read_text()
     path.write_text(text.replace("[drive]", "[vehicle]\ndt_s = 0.2\n[drive]"))
     other = read(path, tmp_path / "run0", 0 * SHIFT, 3)
     with pytest.raises(InputError, match=r"vehicle.dt_s: 0.2 -> 0.1\n"):
-        found_place([found[0], other])
+        found_place([attacks[0], other])
 
 
 CAR = """\
@@ -204,10 +208,10 @@ control_limit = 1.5
 """
 
 
-def test_an_expert_drives_a_vehicle_whose_control_it_knows(found, tmp_path):
+def test_an_expert_drives_a_vehicle_whose_control_it_knows(attacks, tmp_path):
     """It drives the function of a Dubins vehicle as it drives that vehicle."""
     path = tmp_path / "scenario.toml"
-    shutil.copytree(found[0].folder.parent, tmp_path, dirs_exist_ok=True)
+    shutil.copytree(attacks[0].folder.parent, tmp_path, dirs_exist_ok=True)
     (tmp_path / "car.py").write_text(CAR)
     text, driven = path.read_text(), []
     for vehicle in ("", f'{CUSTOM}control_unit = "rad/s"\n', CUSTOM):
@@ -222,8 +226,8 @@ def test_an_expert_drives_a_vehicle_whose_control_it_knows(found, tmp_path):
     assert other.error_m == pytest.approx(one.error_m, abs=1e-6)
 
 
-def test_a_car_drives_over_what_is_low(found, monkeypatch):
-    run = found[0]
+def test_a_car_drives_over_what_is_low(attacks, monkeypatch):
+    run = attacks[0]
     (standing, *_) = attacked_objects(run)
     path = run.route.pose_at(run.route.length / 2)
     for kind in ("patch", "billboard"):

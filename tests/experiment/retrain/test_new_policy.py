@@ -42,9 +42,9 @@ def test_a_new_file_replaces_weights_or_the_whole_section(tmp_path, keys, key, f
     start = keys.get("weights_file") if file is None else file
     assert policy.file == (None if start is None else tmp_path / start)
     if "url" in keys:
-        assert policy.about == {"url": keys["url"]}
+        assert policy.content == {"url": keys["url"]}
     else:
-        assert policy.about["file"].partition(":")[0] == start
+        assert policy.content["file"].partition(":")[0] == start
     policy.check_suffix(Path("new.toml"))
     if key is None:
         with pytest.raises(InputError, match=r"new.safetensors; must end in \.toml,"):

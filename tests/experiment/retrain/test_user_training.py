@@ -91,9 +91,9 @@ def test_a_command_gets_what_it_names_and_is_heard_at_once(
 
 def test_what_was_trained_is_trained_again_where_something_differs(tmp_path):
     order, training = order_in(tmp_path), command(tmp_path, WRITES, ALL)
-    about = train(training, order)
-    assert train(training, order) == about and runs(order) == 1
-    assert list(about["code"]) == [Path(sys.executable).name, "mine.py"]
+    identity = train(training, order)
+    assert train(training, order) == identity and runs(order) == 1
+    assert list(identity["code"]) == [Path(sys.executable).name, "mine.py"]
     train(training, dataclasses.replace(order, threads=1))
     assert runs(order) == 1  # the number of threads decides nothing
     changes = [
@@ -120,9 +120,9 @@ def test_a_module_is_called_here(tmp_path):
     )
     order = order_in(tmp_path)
     training = ModuleTraining(f"{tmp_path / 'mine.py'}:train", trusted=True)
-    about = train(training, order)
+    identity = train(training, order)
     assert order.out.read_text() == "round_0 3"
-    assert about["module"] == training.name and list(about["code"]) == ["mine.py"]
+    assert identity["module"] == training.name and list(identity["code"]) == ["mine.py"]
 
 
 def test_a_module_that_catches_an_interrupt_has_not_trained(tmp_path):

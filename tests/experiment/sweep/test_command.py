@@ -79,7 +79,7 @@ def test_what_is_foreseen(command):
 
 
 def test_what_would_be_refused(command, tmp_path):
-    for text, code, found in (
+    for text, code, message in (
         (GRID + ALOFT, 1, "refused: line aloft: ball is in the air"),
         (
             "anyway = true\n" + GRID + ALOFT,
@@ -87,8 +87,8 @@ def test_what_would_be_refused(command, tmp_path):
             "look at: line aloft: ball is in the air",
         ),
     ):
-        told = command(text, "--no-drives", verb="check")
-        assert told[0] == code and found in told[1]
+        completed = command(text, "--no-drives", verb="check")
+        assert completed[0] == code and message in completed[1]
         assert not (tmp_path / "out").exists()
 
 
@@ -111,9 +111,9 @@ def test_cells_are_done_and_failures_told(command, tmp_path, monkeypatch):
     assert [line.split("-")[2] for line in failed] == ["gradient", "blocks"]
     assert all(line.endswith(": in two lines") for line in failed)
     code, out, _ = command(GRID.replace("4, ", ""), "--json")
-    found = json.loads(out)
-    assert code == 0 and found["complete"] == found["cells"] == 4
-    assert not found["failed"]
+    document = json.loads(out)
+    assert code == 0 and document["complete"] == document["cells"] == 4
+    assert not document["failed"]
 
 
 def test_who_does_the_cells(monkeypatch):

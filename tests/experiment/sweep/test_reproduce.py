@@ -84,18 +84,18 @@ def test_rows_come_back_to_the_bit(swept, command, tmp_path):
     last = len(read_table(copy / "results.csv")) - 2
     words = copy, last, f"{cell.id}:surrogate:own:0", "--json", "-o", tmp_path / "out"
     code, out = command(*words)
-    found = json.loads(out)
+    document = json.loads(out)
     assert code == 0
-    wrong, right = found["rows"]
+    wrong, right = document["rows"]
     assert (wrong["row"], wrong["case"], right["case"]) == (last, "attack", "own")
     assert set(right["difference"].values()) == {0}
     assert right["stored"] == right["repeated"]
     assert wrong["difference"].pop("cross_track_mean_m") == pytest.approx(ROUNDED)
     assert set(wrong["difference"].values()) == {0}
-    [told] = found["cells"]
-    assert (told["cell"], told["rows"], told["unmatched"]) == (cell.id, last + 1, 0)
-    assert told["largest_difference"]["cross_track_mean_m"] == pytest.approx(ROUNDED)
-    assert told["largest_difference"]["frames"] == 0
+    [entry] = document["cells"]
+    assert (entry["cell"], entry["rows"], entry["unmatched"]) == (cell.id, last + 1, 0)
+    assert entry["largest_difference"]["cross_track_mean_m"] == pytest.approx(ROUNDED)
+    assert entry["largest_difference"]["frames"] == 0
     code, out = command(*words[:2], *words[4:], "--tolerance", 0.1)
     assert code == 1 and f"(0.125){chr(10)}" in out  # it is not done again
     code, out = command(*words[:1], *words[2:3], *words[4:], "--tolerance", 0)
@@ -114,10 +114,10 @@ def test_drives_alone_come_back(swept, command, tmp_path):
     folder, _, cell = swept
     out = tmp_path / "out"
     folder_of(out, cell).mkdir(parents=True)  # killed before the checkpoint was there
-    code, told = command(folder, "--rows", 3, "--drives-only", "--json", "-o", out)
-    found = json.loads(told)
-    assert code == 0 and len(found["rows"]) == 3
-    assert set(found["largest_difference"].values()) == {0}
+    code, printed = command(folder, "--rows", 3, "--drives-only", "--json", "-o", out)
+    document = json.loads(printed)
+    assert code == 0 and len(document["rows"]) == 3
+    assert set(document["largest_difference"].values()) == {0}
     cost = files.read_json(folder_of(out, cell) / "metrics.json")["cost"]
     assert cost["processes"] == 2  # the attack's, and this one
 
@@ -168,28 +168,28 @@ def test_sweeps_of_one_name_on_a_page(swept, tmp_path, monkeypatch):
 def test_what_differs_is_told(swept):
     """Versions, drives that there are none of, failures; made by hand."""
     folder, copy, cell = swept
-    wanted = read_replay(copy, ["0"])
+    replay = read_replay(copy, ["0"])
     rows, made = read_table(folder / "results.csv"), read_made(folder)
-    found = compare_rows(wanted, rows[2:], made, {})
-    [row], [told] = found["rows"], found["cells"]
-    assert row["repeated"] is None and found["largest_difference"] is None
-    assert (told["rows"], told["unmatched"]) == (len(rows) - 2, 2)
+    document = compare_rows(replay, rows[2:], made, {})
+    [row], [entry] = document["rows"], document["cells"]
+    assert row["repeated"] is None and document["largest_difference"] is None
+    assert (entry["rows"], entry["unmatched"]) == (len(rows) - 2, 2)
     other = {cell.id: {"versions": {"numpy": "0"}}}
-    lines = sentences(compare_rows(wanted, rows, other, {}))
+    lines = sentences(compare_rows(replay, rows, other, {}))
     assert any(line.endswith("then, 0 here") for line in lines)
-    failed = compare_rows(wanted, rows[:0], {}, {cell.id: "a mistake\nno room"})
+    failed = compare_rows(replay, rows[:0], {}, {cell.id: "a mistake\nno room"})
     assert sentences(failed)[-1].endswith(f"{cell.id}: no room")
 
 
 def test_rows_that_cannot_be_repeated(swept, command, tmp_path):
     folder, copy, cell = swept
-    for names, count, told in (
+    for names, count, message in (
         (["99"], 0, "row 99; .* 0 to"),
         ([f"{cell.id}:moon:own:0"], 0, ":no_object:0"),
         ([str(len(read_table(copy / "results.csv")) - 1)], 0, "no room"),
         ([], 99, "99"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             read_replay(copy, names, count)
     for words in ((copy,), (folder, 0, "-o", folder), (copy, 0, "--drives-only")):
         assert command(*words, *(["-o", tmp_path] if "-o" not in words else []))[0] == 2
@@ -217,9 +217,9 @@ def test_relative_paths_of_a_cell_begin_in_the_parent_of_the_table(
     made[cell.id] |= {"scenario": relative}
     files.write_json(table / "cells.json", made)
     monkeypatch.chdir(table.parents[1])
-    [here] = read_replay(Path("bench/table"), ["0"]).cells
-    assert not changed(here) and "../" not in here.text
-    assert here.scenario.objects[0].field.path == inputs / "object.safetensors"
+    [replayed] = read_replay(Path("bench/table"), ["0"]).cells
+    assert not changed(replayed) and "../" not in replayed.text
+    assert replayed.scenario.objects[0].field.path == inputs / "object.safetensors"
 
 
 def test_a_row_without_its_cell_is_refused(swept, tmp_path):

@@ -31,7 +31,7 @@ OUT = {("right", "gradient", 0): [0.0, 1.9], ("right", "gradient", 1): [2.0, 0.5
 
 
 def rows():
-    found = []
+    records = []
     for (route, method, seed), cases in ERRORS.items():
         labels = {"cell": f"{route}-{method}-{seed}", "route": route, "objects": "car"}
         labels |= {"method": method, "budget": 100, "seed": seed, "error": None}
@@ -42,17 +42,17 @@ def rows():
                 wheel_out_s = out[run] if out else 0.0
                 figures = {"steps": 10, "cross_track_mean_m": error}
                 figures |= {"wheel_out_s": wheel_out_s, "departed": wheel_out_s > 0}
-                found.append(labels | {"case": case, "run": run} | figures)
+                records.append(labels | {"case": case, "run": run} | figures)
     failed = {"cell": "left-gradient-1", "route": "left", "objects": "car", "seed": 1}
     failed |= {"method": "gradient", "budget": 100, "error": "no room"}
-    return with_total(make_table([*found, failed | {"status": "failed"}]))
+    return with_total(make_table([*records, failed | {"status": "failed"}]))
 
 
 def attack(route, method, seed, frames, objective, *flags, attack_method=None):
-    found = {"cell": f"{route}-{method}-{seed}", "route": route, "objects": "car"}
-    found |= {"method": method, "budget": 100, "seed": seed, "flags": flags}
-    found |= {"attack_method": attack_method or method, "converged": not flags}
-    return found | {"curve": {"frames": frames, "objective": objective}}
+    record = {"cell": f"{route}-{method}-{seed}", "route": route, "objects": "car"}
+    record |= {"method": method, "budget": 100, "seed": seed, "flags": flags}
+    record |= {"attack_method": attack_method or method, "converged": not flags}
+    return record | {"curve": {"frames": frames, "objective": objective}}
 
 
 def pick(table, **labels):
@@ -64,12 +64,12 @@ def pick(table, **labels):
 
 def test_groups_by_hand():
     """Attacks count, not drives; cells that failed are named."""
-    found = summarise(rows())
-    assert (found["cells"], found["complete"]) == (6, 5)
-    [failed] = found["failed"]
+    summary = summarise(rows())
+    assert (summary["cells"], summary["complete"]) == (6, 5)
+    [failed] = summary["failed"]
     assert (failed["cell"], failed["error"]) == ("left-gradient-1", "no room")
-    wanted = {"method": "gradient", "case": "attack"}
-    right = pick(found["groups"], route="right", **wanted)
+    labels = {"method": "gradient", "case": "attack"}
+    right = pick(summary["groups"], route="right", **labels)
     assert (right["attacks"], right["places"], right["seeds"]) == (2, 1, 2)
     assert right["cross_track_mean_m"] == pytest.approx((0.5 + 0.9) / 2)
     assert right["cross_track_sd_m"] == pytest.approx(math.sqrt(2 * 0.2**2))
@@ -79,35 +79,35 @@ def test_groups_by_hand():
     assert out == [1, 3, 4]
     few = "cross_track_mean_ci95_m", "attacks_out_rate_ci95", "departure_rate_ci95"
     assert [right[name] for name in few] == [None] * 3
-    together = pick(found["groups"], route=None, **wanted)
+    together = pick(summary["groups"], route=None, **labels)
     assert together["cross_track_mean_m"] == pytest.approx((0.5 + 0.9 + 1.3) / 3)
     assert (together["attacks"], together["places"], together["seeds"]) == (3, 2, 2)
-    left = pick(found["groups"], route="left", **wanted)
+    left = pick(summary["groups"], route="left", **labels)
     assert left["cross_track_sd_m"] is None and left["cross_track_mean_ci95_m"] is None
 
 
 def test_comparisons_by_hand():
-    found = summarise(rows())["comparisons"]
-    chance = pick(found, route="right", method="gradient", other_case="random")
+    comparisons = summarise(rows())["comparisons"]
+    chance = pick(comparisons, route="right", method="gradient", other_case="random")
     # 0.5 less 0.2 and 0.9 less 0.1
     assert chance["effect"]["difference"] == pytest.approx(0.55)
     assert chance["effect"]["ratio"] == pytest.approx(0.7 / 0.15)
     assert chance["effect"]["spread"] == pytest.approx(0.25 * math.sqrt(2))
     assert (chance["departures"]["one"], chance["departures"]["neither"]) == (1, 1)
-    clean = pick(found, route="right", method="gradient", other_case="no_object")
+    clean = pick(comparisons, route="right", method="gradient", other_case="no_object")
     assert clean["effect"]["difference"] == pytest.approx(0.6)
-    blocks = pick(found, route="right", other_method="gradient", method="blocks")
+    blocks = pick(comparisons, route="right", other_method="gradient", method="blocks")
     assert blocks["other_case"] == "attack"
     assert blocks["effect"]["difference"] == pytest.approx(0.4 - 0.7)
     # two drives of the left route have no partner among those of blocks
-    together = pick(found, route=None, other_method="gradient", method="blocks")
+    together = pick(comparisons, route=None, other_method="gradient", method="blocks")
     assert (together["effect"]["attacks"], together["effect"]["unpaired"]) == (2, 2)
     assert together["effect"]["difference"] == pytest.approx(-0.3)
 
 
 def test_flags_of_the_sweep():
     """A search that finds more; an effect that seeds exceed; what attacks told."""
-    told = [
+    attacks = [
         attack("right", "gradient", 0, [10, 30], [0.0, -5.0], "not converged: wait"),
         attack("right", "gradient", 1, [10, 30], [0.0, -5.0], "not converged: stay"),
         # a poorer setting of the gradient is no opponent
@@ -118,7 +118,7 @@ def test_flags_of_the_sweep():
             *("right", "ahead", 0, [10, 30], [-1.0, -9.0]), attack_method="open_loop"
         ),
     ]
-    better, noise, own = summarise(rows(), told)["flags"]
+    better, noise, own = summarise(rows(), attacks)["flags"]
     for flag, name, words in (
         (
             better,

@@ -34,9 +34,9 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 def sweep(cells, folder, task):
-    found = Sweep(Cells(tuple(cells), folder, task=task))
-    found.run(InThisProcess())
-    return found
+    swept = Sweep(Cells(tuple(cells), folder, task=task))
+    swept.run(InThisProcess())
+    return swept
 
 
 def table(folder):
@@ -71,8 +71,8 @@ def figures_of(cell):
 
 
 def test_the_table(cells, tmp_path):
-    found = sweep(cells, tmp_path, Tasks())
-    assert found.steps == 4 and not found.errors
+    swept = sweep(cells, tmp_path, Tasks())
+    assert swept.steps == 4 and not swept.errors
     assert table(tmp_path) == [figures_of(cell) for cell in cells]
     assert read_made(tmp_path) == {
         cell.id: {
@@ -114,17 +114,17 @@ def test_numbers_and_texts_come_back_as_they_were(tmp_path):
     labels = {"cell": 'a, "b"\nc', "route": "NA", "seed": 2**60}
     rows = [labels | {"cross_track_mean_m": value} for value in values.tolist()]
     write_csv(tmp_path / "table.csv", make_table(rows))
-    found = records(read_csv(tmp_path / "table.csv", COLUMNS))
-    assert found == records(make_table(rows))
-    assert [row["cross_track_mean_m"] for row in found] == values.tolist()
-    assert all(row[name] == value for row in found for name, value in labels.items())
+    restored = records(read_csv(tmp_path / "table.csv", COLUMNS))
+    assert restored == records(make_table(rows))
+    assert [row["cross_track_mean_m"] for row in restored] == values.tolist()
+    assert all(row[name] == value for row in restored for name, value in labels.items())
 
 
 def test_failed_cells_are_tried_twice_more_and_stay_as_rows(cells, tmp_path):
     first = Tasks({1: 2, 2: 9})
-    found = sweep(cells, tmp_path, first)
+    swept = sweep(cells, tmp_path, first)
     assert first.done == [0, 1, 2, 3, 1, 2, 1, 2]
-    assert list(found.errors) == [2]
+    assert list(swept.errors) == [2]
     rows = {row["seed"]: row for row in table(tmp_path)}
     assert [rows[seed]["status"] for seed in range(4)] == [
         *("complete", "complete", "failed", "complete")
@@ -137,7 +137,7 @@ def test_failed_cells_are_tried_twice_more_and_stay_as_rows(cells, tmp_path):
     (tmp_path / "results.csv").unlink()  # it is made of the cells
     last = Tasks()
     again = sweep(cells, tmp_path, last)
-    assert last.done == [2] and again.kept == 3 and not again.errors
+    assert last.done == [2] and again.already_complete == 3 and not again.errors
     assert [row["status"] for row in table(tmp_path)] == ["complete"] * 4
     assert not list((tmp_path / "failed").iterdir())
 
@@ -151,8 +151,8 @@ def test_a_cell_that_would_prove_nothing_is_refused_once(cells, tmp_path):
             raise RefusedError("an attack would prove nothing")
         finish(cell, folder)
 
-    found = sweep(cells, tmp_path, task)
-    assert done == [0, 1, 2, 3] and list(found.errors) == [1]
+    swept = sweep(cells, tmp_path, task)
+    assert done == [0, 1, 2, 3] and list(swept.errors) == [1]
     assert table(tmp_path)[1]["error"] == "an attack would prove nothing"
     # from process to process
     assert isinstance(failure(0, _failed(RefusedError("no"))), RefusedError)
@@ -161,15 +161,15 @@ def test_a_cell_that_would_prove_nothing_is_refused_once(cells, tmp_path):
 
 def test_cells_of_another_grid_are_not_in_the_table(cells, tmp_path):
     sweep(cells[:2], tmp_path, Tasks())
-    found = Tasks()
-    sweep(cells[1:3], tmp_path, found)
-    assert found.done == [2]
+    tasks = Tasks()
+    sweep(cells[1:3], tmp_path, tasks)
+    assert tasks.done == [2]
     assert [row["seed"] for row in table(tmp_path)] == [1, 2]
 
 
 def test_a_cell_whose_files_are_on_another_disk_has_failed(cells, tmp_path):
-    found = sweep(cells[:1], tmp_path, lambda cell, folder, on_step: None)
-    assert "disk that all machines share" in found.errors[0]
+    swept = sweep(cells[:1], tmp_path, lambda cell, folder, on_step: None)
+    assert "disk that all machines share" in swept.errors[0]
 
 
 def test_a_cell_is_refused_where_its_files_are_others(cells, tmp_path):
@@ -227,8 +227,8 @@ def test_shared_drives_are_those_of_a_cell_alone(methods, tmp_path, no_results):
         saved += second.scenario.drive.horizon * (not one.name.startswith(ATTACK))
     assert len(steps["alone"]) - len(steps["together"]) == saved
     written = folders[0] / "cell.json"
-    about, time = files.read_json(written), written.stat().st_mtime_ns
-    assert about["digests"] == second.digests and "mitsuba" in about["versions"]
+    record, time = files.read_json(written), written.stat().st_mtime_ns
+    assert record["digests"] == second.digests and "mitsuba" in record["versions"]
     # a cell that is complete is not done again
     run_cell(second, together, lambda: None)
     assert is_complete(together, second) and written.stat().st_mtime_ns == time
@@ -240,7 +240,7 @@ def test_what_decides_about_a_drive_tells_it_apart(methods, tmp_path):
     look = world.appearance()
 
     def digest(world=world, label="surrogate", look: Appearance | None = look, run=0):
-        identity, quiet = world.scenario.identity(), lambda *told: None
+        identity, quiet = world.scenario.identity(), lambda *report: None
         cases = Cases(world, Store(tmp_path), identity, quiet, quiet)
         cases.looks["own"] = look
         return cases.of_case(label, "own")[run].digest
@@ -289,18 +289,18 @@ def elsewhere(cells, tmp_path):
 
 
 def test_complete_cells_are_not_done_again(cells, elsewhere, tmp_path):
-    whole, again = tmp_path / "whole", tmp_path / "again"
+    reference, again = tmp_path / "whole", tmp_path / "again"
     other = replace(cells[2], digests={"scenario": "0123456789abcdef"})
     changed = [*cells[:2], other, cells[3]]
     done, summary = sweep_taking(changed, again, read_taken([elsewhere]))
     assert done == [2, 3]  # another cell, and the one that had failed
     assert not folder_of(again, cells[0]).exists()
-    _, alone = sweep_taking(changed, whole, Taken(rows={"none": []}))
+    _, alone = sweep_taking(changed, reference, Taken(rows={"none": []}))
     assert summary == alone and len(summary["attacks"]) == 4
     for name in ("results.csv", "cells.json"):
-        assert (again / name).read_text() == (whole / name).read_text()
+        assert (again / name).read_text() == (reference / name).read_text()
     made = read_made(again)
-    assert {name: about["scenario"] for name, about in made.items()} == {
+    assert {name: record["scenario"] for name, record in made.items()} == {
         cell.id: cell.text for cell in changed
     }
     # what was taken stays told where the folder's own summary is all that there is

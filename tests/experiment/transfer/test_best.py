@@ -18,10 +18,10 @@ def row(cell, method, seed, error, case="attack", route="right"):
 
 def rows():
     """Return two drives an attack: a at 0.3, b at 0.5, c at 0.2, and a look at 9."""
-    found = [row("a", "gradient", 1, error) for error in (0.1, 0.5)]
-    found += [row("b", "gradient", 2, error) for error in (0.4, 0.6)]
-    found += [row("c", "random", 1, error) for error in (0.2, 0.2)]
-    return [*found, row("c", "random", 1, 9.0, case="random")]
+    records = [row("a", "gradient", 1, error) for error in (0.1, 0.5)]
+    records += [row("b", "gradient", 2, error) for error in (0.4, 0.6)]
+    records += [row("c", "random", 1, error) for error in (0.2, 0.2)]
+    return [*records, row("c", "random", 1, 9.0, case="random")]
 
 
 def test_the_best_of_a_method_at_a_place_stands_for_it(tmp_path):

@@ -49,11 +49,11 @@ SETTINGS = (
 ROWS = 3 + 3 * 4  # the surrogate has no exposure
 
 
-def command(run: Path, *more: str) -> list[str]:
+def command(run: Path, *options: str) -> list[str]:
     names, conditions = SETTINGS
     words = ["transfer", str(run), "-o", "out", "--workers", "1", "--json"]
     words += ["--runs", "2", "--spp", "1", "--environments", *names]
-    return [*words, "--conditions", *conditions, *more]
+    return [*words, "--conditions", *conditions, *options]
 
 
 def planned(folder, runs, environments, conditions="day", cases=CASES, starts=2):
@@ -74,12 +74,12 @@ def digests(work, number=0):
 
 
 def kept_drive(run: Path, environment: str, case: str, number: int):
-    (found,) = (
+    (arrays,) = (
         drive.arrays()
         for drive in read_drives(run / "drives")
         if (drive.environment, drive.case, drive.run) == (environment, case, number)
     )
-    return found
+    return arrays
 
 
 @pytest.mark.parametrize("environment", ["surrogate", "mitsuba"])
@@ -88,21 +88,21 @@ def test_attacks_are_driven_unchanged(found_run, environment):
 
     Past the attack but for what files of objects round: they have half precision.
     """
-    found = read_found([found_run])
-    assert found[0].offsets.any()
-    opened = TransferDriver(found)
-    column, seed = Column(environment, Condition(), 1), found[0].scenario.seed + 1
+    attacks = read_found([found_run])
+    assert attacks[0].offsets.any()
+    opened = TransferDriver(attacks)
+    column, seed = Column(environment, Condition(), 1), attacks[0].scenario.seed + 1
     for case in CASES:
         world, identity = opened.world(0), {"case": case}
         batch = Batch(0, column, case, identity)
-        about = environment, "line", case, 1, seed, world.horizon, identity
-        spec = DriveSpec(*about, how=(batch, world.initial[1]))
+        labels = environment, "line", case, 1, seed, world.horizon, identity
+        spec = DriveSpec(*labels, context=(batch, world.initial[1]))
         with one_thread():
             result = opened.drive(spec, lambda step: None)
-        kept = kept_drive(found_run, environment, case, 1)
+        stored = kept_drive(found_run, environment, case, 1)
         for name, array in result.arrays().items():
             atol = 5e-5 if case == "attack" else 0
-            np.testing.assert_allclose(array, kept[name], 0, atol, err_msg=case)
+            np.testing.assert_allclose(array, stored[name], 0, atol, err_msg=case)
     opened.close()
 
 
@@ -136,25 +136,25 @@ def test_the_command_drives_all_rows(found_run, tmp_path, monkeypatch, capsys):
 def test_conditions_change_drives_and_own_objects_differ(found_run, tmp_path):
     conditions = ("day", "placement:0.3", "pitch:3")
     work = planned(tmp_path, [found_run], "surrogate", " ".join(conditions))
-    found = run_drives(work, InThisProcess())
+    driven = run_drives(work, InThisProcess())
     controls = {
         batch.digest: [item.drive.controls for item in items]
-        for batch, items in zip(work.batches, found, strict=True)
+        for batch, items in zip(work.batches, driven, strict=True)
     }
-    seen = {key[1:]: controls[digest] for key, digest in digests(work).items()}
+    by_case = {key[1:]: controls[digest] for key, digest in digests(work).items()}
     for case in CASES:
-        plain, moved, turned = (seen[condition, case] for condition in conditions)
+        plain, moved, turned = (by_case[condition, case] for condition in conditions)
         same = [np.array_equal(a, b) for a, b in zip(plain, moved, strict=True)]
         assert all(same) if case == "no_object" else not any(same)
         assert not any(np.array_equal(a, b) for a, b in zip(plain, turned, strict=True))
-    assert not np.array_equal(seen["day", "own"], seen["day", "attack"])
-    assert not np.array_equal(*seen["day", "own"])  # two starts
+    assert not np.array_equal(by_case["day", "own"], by_case["day", "attack"])
+    assert not np.array_equal(*by_case["day", "own"])  # two starts
 
 
 def test_drives_without_what_was_found_are_shared(found_run, tmp_path):
     other = another(found_run, tmp_path / "other", 2.0)
     work = planned(tmp_path / "drives", [found_run, other], "surrogate mitsuba")
-    assert [found.label for found in work.attacks] == ["run", "other"]
+    assert [attack.label for attack in work.attacks] == ["run", "other"]
     assert len(work.rows) == 4
     assert len(work.batches) == 2 * (2 + 2 * 2)
     again = pickle.loads(pickle.dumps(work))  # as workers get it
@@ -170,10 +170,10 @@ def test_drives_without_what_was_found_are_shared(found_run, tmp_path):
 def test_what_decides_about_drives_in_the_surrogate(found_run, tmp_path, key):
     """Attached attacks see thin parts of fields; nothing of it is in other worlds."""
     work = planned(tmp_path, [found_run], "surrogate mitsuba")
-    (found,) = work.attacks
-    attack = found.scenario.attack.model_copy(update={key: True})
-    scenario = found.scenario.model_copy(update={"attack": attack})
-    other = replace(work, attacks=(replace(found, scenario=scenario),))
+    (original,) = work.attacks
+    attack = original.scenario.attack.model_copy(update={key: True})
+    scenario = original.scenario.model_copy(update={"attack": attack})
+    other = replace(work, attacks=(replace(original, scenario=scenario),))
     one, two = digests(work), digests(other)
     assert {name[0] for name in one if one[name] != two[name]} == {"surrogate"}
 
@@ -212,12 +212,14 @@ def test_ratios_and_rates_count_attacks(found_run, tmp_path):
         for (number, column), row in work.rows.items()
     }
     document = make_document(work, figures)
-    here, there = document["columns"]
-    assert here["transfer"]["of"] == here["transfer"]["kept"] == 2
-    attack = there["cases"]["attack"]
-    assert (there["transfer"]["of"], there["transfer"]["kept"]) == (2, 1)
+    surrogate, deployment = document["columns"]
+    assert surrogate["transfer"]["of"] == surrogate["transfer"]["kept"] == 2
+    attack = deployment["cases"]["attack"]
+    assert (deployment["transfer"]["of"], deployment["transfer"]["kept"]) == (2, 1)
     assert attack["attacks_out"] == 2
-    assert there["ratio_to_surrogate"] == pytest.approx((0.5 * 0.25 * 1.0) ** (1 / 3))
+    assert deployment["ratio_to_surrogate"] == pytest.approx(
+        (0.5 * 0.25 * 1.0) ** (1 / 3)
+    )
     assert attack["cross_track_mean_m"] == pytest.approx(0.5 / 3)
     # a row that is not whole is left out, and the summary with it
     figures.popitem()
@@ -244,8 +246,8 @@ def test_attacks_in_several_surrogates_are_grouped_by_them(
     assert (bad["psnr_heldout_db"], good["psnr_heldout_db"]) == (15.25, 28.5)
     assert bad["steps"] == good["steps"] == 40
     assert (bad["attacks"], good["attacks"]) == (["bad"], ["good"])
-    kept = [s["columns"][2]["transfer"]["kept"] for s in (bad, good)]
-    assert kept == [0, 1]
+    transferred = [s["columns"][2]["transfer"]["kept"] for s in (bad, good)]
+    assert transferred == [0, 1]
     assert bad["columns"][2]["environment"] == "mitsuba"
     figures_drawn = drawn(monkeypatch)
     plot_quality(tmp_path / "quality.png", document)
@@ -274,14 +276,14 @@ def with_surrogate(run: Path, folder: Path, name: str, psnr: float) -> Path:
 
 
 def test_starts_are_unseen_and_do_not_depend_on_their_number(found_run, tmp_path):
-    (found,) = read_found([found_run])
-    starts = [found.start(1, number) for number in range(3)]
+    (attack,) = read_found([found_run])
+    starts = [attack.start(1, number) for number in range(3)]
     assert len({seed for _, seed in starts}) == 3
     poses = np.array([pose for pose, _ in starts])
     assert (np.ptp(poses[:, 1:], axis=0) > 0).all()
-    np.testing.assert_array_equal(found.start(1, 2)[0], poses[2])
-    assert not np.array_equal(found.start(2, 0)[0], poses[0])
-    found.check_starts(1, 50)
+    np.testing.assert_array_equal(attack.start(1, 2)[0], poses[2])
+    assert not np.array_equal(attack.start(2, 0)[0], poses[0])
+    attack.check_starts(1, 50)
     fixed = another(found_run, tmp_path / "fixed", 1.0)
     (fixed / "checkpoint.safetensors").unlink()
     text = (fixed / "scenario.toml").read_text()

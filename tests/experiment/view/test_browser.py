@@ -26,7 +26,7 @@ def draws(page, path):
 
 def check_alone(page, *known):
     """Check that nothing was complained of, and nothing else was fetched."""
-    assert page.told == []
+    assert page.messages == []
     assert [x for x in page.requests if not x.startswith(known)] == []
 
 
@@ -39,8 +39,8 @@ def test_a_file_opens_by_itself(found_run, tmp_path):
         page.wait(f"!!{SLIDER}")
         assert page.ask("document.title") == "kill: mitsuba, attack"
         page.until(lambda: draws(page, tmp_path / "file.png"), "drawing")
-        told = f"{SLIDER}.getAttribute('aria-valuemax')"
-        assert float(page.ask(told)) == pytest.approx(0.3)  # two periods and the end
+        script = f"{SLIDER}.getAttribute('aria-valuemax')"
+        assert float(page.ask(script)) == pytest.approx(0.3)  # two periods and the end
         check_alone(page, path.as_uri(), "data:", "blob:")
 
 
@@ -86,12 +86,12 @@ def test_a_reader_uses_the_page_of_results(tmp_path, width):
         page.resize(width, 900)
         page.go(path.as_uri())
         page.wait("document.readyState === 'complete' && !!document.body.children[0]")
-        found = page.ask(USE)
+        answer = page.ask(USE)
         check_alone(page, path.as_uri(), "data:")
     # the slider begins where the gradient has its largest share: after two periods
-    assert (found["first"], found["moved"]) == ("0.2 s, -0.30 m", "0.3 s, +0.20 m")
-    assert found["at"] == "0px 100%"
-    assert found["buttons"] == ["Pause", "Play"]
-    assert found["grounds"][0] != found["grounds"][1]
-    assert found["wide"] <= 0
-    assert found["shut"][0] == 0 < found["shut"][1]
+    assert (answer["first"], answer["moved"]) == ("0.2 s, -0.30 m", "0.3 s, +0.20 m")
+    assert answer["at"] == "0px 100%"
+    assert answer["buttons"] == ["Pause", "Play"]
+    assert answer["grounds"][0] != answer["grounds"][1]
+    assert answer["wide"] <= 0
+    assert answer["shut"][0] == 0 < answer["shut"][1]

@@ -73,9 +73,9 @@ def test_offset_puts_an_object_where_the_handle_is():
     for _ in range(20):
         start = Pose(Rotation.random(rng=rng).as_matrix(), rng.normal(size=3), 1.7)
         turned, position = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
-        found = start.moved(offset_of(start, position, to_wxyz(turned)))
-        np.testing.assert_allclose(found.rotation, turned, atol=1e-9)
-        np.testing.assert_allclose(found.translation, position, atol=1e-9)
+        moved = start.moved(offset_of(start, position, to_wxyz(turned)))
+        np.testing.assert_allclose(moved.rotation, turned, atol=1e-9)
+        np.testing.assert_allclose(moved.translation, position, atol=1e-9)
 
 
 def test_points_lie_behind_their_pixels():
@@ -85,28 +85,28 @@ def test_points_lie_behind_their_pixels():
     depth[:, 10:] = 20.0
     depth[4, 4], depth[0, :5] = 12.0, np.inf  # between two things, and the sky
     image = np.arange(12 * 20 * 3).reshape(12, 20, 3).astype(np.uint8)
-    found = frame_points(CameraFrame(image, depth, pose), PixelRays(camera))
-    kept = np.isfinite(depth) & (depth != 12.0)
-    rows, columns = np.nonzero(kept)
+    cloud = frame_points(CameraFrame(image, depth, pose), PixelRays(camera))
+    valid = np.isfinite(depth) & (depth != 12.0)
+    rows, columns = np.nonzero(valid)
     np.testing.assert_allclose(
-        seen_at(camera, pose, found.points),
+        seen_at(camera, pose, cloud.points),
         np.stack([columns, rows], axis=1) + 0.5,
         atol=1e-3,
     )
-    away = np.linalg.norm(found.points - pose[:3, 3], axis=1)
-    np.testing.assert_allclose(away, depth[kept], rtol=1e-5)
-    np.testing.assert_array_equal(found.colours, image[kept])
+    away = np.linalg.norm(cloud.points - pose[:3, 3], axis=1)
+    np.testing.assert_allclose(away, depth[valid], rtol=1e-5)
+    np.testing.assert_array_equal(cloud.colours, image[valid])
 
 
 def test_thinned_keeps_one_point_a_cell():
     rng = np.random.default_rng(1)
     points = rng.uniform(-2, 2, (4000, 3))
     colours = rng.integers(0, 256, (4000, 3), dtype=np.uint8)
-    found = thinned(Cloud(points, colours), 1.0)
-    cells = {tuple(cell) for cell in np.floor(found.points).astype(int)}
-    assert len(cells) == len(found.points) == 4**3
-    first = np.nonzero((points == found.points[0]).all(1))[0][0]
-    np.testing.assert_array_equal(found.colours[0], colours[first])
+    cloud = thinned(Cloud(points, colours), 1.0)
+    cells = {tuple(cell) for cell in np.floor(cloud.points).astype(int)}
+    assert len(cells) == len(cloud.points) == 4**3
+    first = np.nonzero((points == cloud.points[0]).all(1))[0][0]
+    np.testing.assert_array_equal(cloud.colours[0], colours[first])
     assert 0 < len(thinned(Cloud(points, colours), 0.01, 100).points) <= 100
 
 
@@ -123,9 +123,9 @@ def test_cloud_is_of_the_scene_alone(contents, viewed):
 def test_heat_is_brightest_from_half_on():
     light = np.zeros((1, 3, 3), np.uint8)
     light[0, 1], light[0, 2] = FULL, 255
-    found = heat(light, 0 * light)
-    np.testing.assert_array_equal(found[0, 1], found[0, 2])
-    assert found[0, 1].sum() > found[0, 0].sum()
+    image = heat(light, 0 * light)
+    np.testing.assert_array_equal(image[0, 1], image[0, 2])
+    assert image[0, 1].sum() > image[0, 0].sum()
 
 
 @pytest.mark.parametrize("label", ["surrogate", "mitsuba"])
@@ -159,9 +159,11 @@ def test_environments_of_an_older_run_get_their_names_of_today(
     copy = shutil.copytree(found_run, tmp_path / "run")
     (copy / "drives/mitsuba").rename(older := copy / "drives/deployment")
     for path in older.iterdir():
-        tensors, about = files.read_safetensors(path)
-        about["kept.record"] = about["kept.record"].replace("mitsuba", "deployment")
-        files.write_safetensors(path, tensors, about)
+        tensors, metadata = files.read_safetensors(path)
+        metadata["kept.record"] = metadata["kept.record"].replace(
+            "mitsuba", "deployment"
+        )
+        files.write_safetensors(path, tensors, metadata)
     assert [d.environment for d in read_drives(older.parent)].count("deployment") > 2
     names, expected = (
         [drive_name(d) for d in v.shown] for v in (read_viewed(copy), viewed)
@@ -170,34 +172,34 @@ def test_environments_of_an_older_run_get_their_names_of_today(
 
 
 def test_what_is_asked_for_is_rendered_once(viewer, viewed):
-    first = viewer.seen.image
+    first = viewer.picture.image
     assert not viewer.turn(0)
     viewer.slider.value = 2
     assert viewer.turn(0)
-    assert not np.array_equal(viewer.seen.image, first)
+    assert not np.array_equal(viewer.picture.image, first)
     pose = viewed.cameras(viewed.drive())[2]
     np.testing.assert_allclose(viewer.scene.camera.position, pose[:3, 3])
-    assert "0.2 s" in viewer.told.content
+    assert "0.2 s" in viewer.description.content
     viewer.slider.value = 0
     viewer.choice.value = "surrogate: no_object"
     assert viewer.turn(0) and not viewer.apart.visible
-    assert not np.array_equal(viewer.seen.image, first)
+    assert not np.array_equal(viewer.picture.image, first)
 
 
 def test_dragged_typed_and_put_back(viewer, viewed):
-    first, x = viewer.seen.image, viewer.positions[0].value[0]
+    first, x = viewer.picture.image, viewer.positions[0].value[0]
     viewer.handles[0].position = viewer.handles[0].position + [0, 0, 50.0]
     viewer._drag(0, None)
-    assert viewer.turn(0) and module.HAND_MOVED in viewer.told.content
+    assert viewer.turn(0) and module.HAND_MOVED in viewer.description.content
     bare = FrameSource(viewed).see(viewed.drive(), 0, "no_object")
-    np.testing.assert_array_equal(viewer.seen.image, bare)
+    np.testing.assert_array_equal(viewer.picture.image, bare)
     assert viewer.positions[0].value[2] > 50
     viewer.positions[0].value = (x, 0.0, -50.0)
     assert viewer.turn(0)
     np.testing.assert_allclose(viewer.handles[0].position, [x, 0, -50])
     viewer._put_back(None)
-    assert viewer.turn(0) and module.HAND_MOVED not in viewer.told.content
-    np.testing.assert_array_equal(viewer.seen.image, first)
+    assert viewer.turn(0) and module.HAND_MOVED not in viewer.description.content
+    np.testing.assert_array_equal(viewer.picture.image, first)
 
 
 def test_played_in_time(viewer, monkeypatch):
@@ -225,7 +227,7 @@ def test_an_environment_that_does_not_open_is_told(viewer, monkeypatch):
     monkeypatch.setattr(type(viewer.viewed.world), "open", refuse)
     viewer.choice.value = "mitsuba: attack"
     assert viewer.turn(0)
-    assert "no server listens" in viewer.told.content
+    assert "no server listens" in viewer.description.content
 
 
 def test_what_cannot_be_shown_is_refused(found_run, viewed, tmp_path, capsys):

@@ -61,11 +61,11 @@ def test_parts_are_finer_near_the_route(field):
     centre = -1 + 2 * (np.argwhere(plan.occupancy.cells) + 0.5) / (6, 5, 4)
     x = np.clip(centre[:, 0], -1.6, 0.2)
     distance = np.hypot(centre[:, 0] - x, centre[:, 1] - 0.1)
-    parts = 0.5 / plan.subdivisions  # of the longest edge of a cell
-    assert (parts <= np.maximum(0.3 * distance * 1.5, 0.5 / 8)).all()
+    edges = 0.5 / plan.subdivisions  # of the longest edge of a cell
+    assert (edges <= np.maximum(0.3 * distance * 1.5, 0.5 / 8)).all()
     finer = plan.subdivisions < 8
     assert finer.any() and not finer.all()
-    assert (2 * parts[finer] > 0.3 * distance[finer] * 0.7).all()
+    assert (2 * edges[finer] > 0.3 * distance[finer] * 0.7).all()
     assert plan.peak_mb > plan.file_mb > 0
 
 
@@ -79,7 +79,7 @@ def test_refinement_brings_bricks_to_the_field(field):
         views = score_bake(*pair, [ROUTE], CAMERA, MOUNT, spacing_m=0.5, keep=2)
         assert sum(view.pictures is not None for view in views) == 2
         worst = min(views, key=lambda view: view.psnr_db)
-        assert worst.pictures is not None and worst.pictures.wanted.std() > 0.02
+        assert worst.pictures is not None and worst.pictures.expected.std() > 0.02
         least.append(worst.psnr_db)
     assert least[1] > max(least[0] + 1, 28)
 
@@ -109,12 +109,12 @@ def test_no_two_draws_share_a_seed(field, monkeypatch):
 def test_a_pose_moves_the_bricks_with_the_field(field):
     wide, high = Route("wide", 0, POINTS, 7.0), CameraMount(0.8, 0.0, 10.0)
     options, posed = BakeOptions(cone=0.3, views=4), PosedField(field, POSE)
-    here = bake(PosedField(field), [ROUTE], CAMERA, MOUNT, options)
-    there = bake(posed, [wide], CAMERA, high, options)
-    np.testing.assert_array_equal(there.subdivisions, here.subdivisions)
-    words = [baked.vertices.numpy() for baked in (here, there)]
+    original = bake(PosedField(field), [ROUTE], CAMERA, MOUNT, options)
+    moved = bake(posed, [wide], CAMERA, high, options)
+    np.testing.assert_array_equal(moved.subdivisions, original.subdivisions)
+    words = [baked.vertices.numpy() for baked in (original, moved)]
     assert np.mean(words[0] == words[1]) > 0.9
-    views = score_bake(posed, PosedField(there, POSE), [wide], CAMERA, high, 1.0)
+    views = score_bake(posed, PosedField(moved, POSE), [wide], CAMERA, high, 1.0)
     assert min(view.psnr_db for view in views) > 25
 
 

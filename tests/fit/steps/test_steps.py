@@ -89,12 +89,14 @@ def test_wide_step_equals_the_march(rng, alpha):
     field = ngp(rng)
     batches = source(field, (EXPOSURE,) if not alpha else (), alpha)
     expected, loss = run(MarchStep(field, batches), field)
-    found, again = run(PointStep(field, batches, 4096, 4096), field)
+    gradients, again = run(PointStep(field, batches, 4096, 4096), field)
     assert again == pytest.approx(loss, rel=1e-5)
     for name, value in expected.items():
         scale = np.abs(value).max()
         assert scale > 0 or (alpha and name == "sky")
-        np.testing.assert_allclose(found[name], value, atol=2e-5 * scale, err_msg=name)
+        np.testing.assert_allclose(
+            gradients[name], value, atol=2e-5 * scale, err_msg=name
+        )
 
 
 def test_rays_beyond_the_room_for_samples_are_left_out(rng):
@@ -102,7 +104,7 @@ def test_rays_beyond_the_room_for_samples_are_left_out(rng):
     step = PointStep(field, source(field), 4096, 300)
     attach(field, step.source.bank.corrections)
     score, _ = step(random_numbers(), dr.opaque(mi.UInt32, RAYS))
-    assert 0 < score.rays[0] < RAYS and score.kept[0] <= 300
+    assert 0 < score.rays[0] < RAYS and score.visible[0] <= 300
 
 
 def test_listed_samples_are_those_that_rays_cross():
@@ -128,10 +130,10 @@ def test_gradient_by_the_poses_equals_that_of_the_march(rng):
     field.density_scale = 6.0
     batches = source(field, (POSES,))
     expected, _ = run(MarchStep(field, batches), field)
-    found, _ = run(PointStep(field, batches, 4096, 4096), field)
+    gradients, _ = run(PointStep(field, batches, 4096, 4096), field)
     scale = np.abs(expected[POSES]).max()
     assert scale > 0
-    np.testing.assert_allclose(found[POSES], expected[POSES], atol=1e-4 * scale)
+    np.testing.assert_allclose(gradients[POSES], expected[POSES], atol=1e-4 * scale)
 
 
 @pytest.mark.parametrize("block", [1 << 12, 4])
@@ -182,10 +184,10 @@ def test_spread_and_its_derivative_against_all_pairs(rng):
     ray, widths = dr.zeros(mi.UInt32, count), dr.full(mi.Float, width, count)
     one = mi.UInt32([0]), mi.UInt32([count]), mi.Bool([True])
     samples = Samples(*one, ray, t, widths)
-    found = measure_spread(samples, x, t, mi.Float(width), mi.Float(factor))
-    assert found.penalty[0] == pytest.approx(penalty(depths), rel=1e-5)
+    spread = measure_spread(samples, x, t, mi.Float(width), mi.Float(factor))
+    assert spread.penalty[0] == pytest.approx(penalty(depths), rel=1e-5)
     black, nothing = dr.zeros(mi.Color3f, count), March.zeros(1)
-    by_depth, _ = cotangents(samples, x, black, nothing, nothing, found)
+    by_depth, _ = cotangents(samples, x, black, nothing, nothing, spread)
     for k, step in enumerate(1e-5 * np.eye(count)):
         central = (penalty(depths + step) - penalty(depths - step)) / 2e-5
         assert by_depth[k] == pytest.approx(factor * central, rel=1e-4, abs=1e-6)
@@ -207,10 +209,10 @@ def test_moved_rays_are_those_of_the_corrected_poses(rng):
     poses = corrections.poses(images.camera_to_world)
     moved = replace(images, camera_to_world=poses)
     index = mi.UInt32(rng.integers(COUNT * 24 * 24, size=50).tolist())
-    found = RayBank(images, np.arange(COUNT), corrections=corrections).batch(index)
+    batch = RayBank(images, np.arange(COUNT), corrections=corrections).batch(index)
     expected = RayBank(moved, np.arange(COUNT)).batch(index)
     for part in ("origin", "direction"):
-        a, b = getattr(found, part).numpy(), getattr(expected, part).numpy()
+        a, b = getattr(batch, part).numpy(), getattr(expected, part).numpy()
         np.testing.assert_allclose(a, b, atol=1e-5)
 
 
@@ -227,7 +229,7 @@ def views(lens: Camera, *looks, points=None) -> PosedImages:
     return PosedImages(pixels, poses, lens, names, points=points)
 
 
-def seen(images: PosedImages, chosen, *places, edge: int = 40) -> list[bool]:
+def visibility(images: PosedImages, chosen, *places, edge: int = 40) -> list[bool]:
     """Return whether the cells at places of a box of 20 m are seen."""
     cells = seen_cells(images, np.array(chosen), LOW, HIGH, (edge,) * 3)
     scale = edge / 20
@@ -239,12 +241,16 @@ def test_cells_that_cameras_see():
     looks = ((0, 0, 0), (1, 0, 0)), ((5, -5, 0), (5, 0, 0))
     images = views(wide, *looks)
     ahead = (8, 0, 0), (8, 7, 7), (3, 0, 0), (-8, 0, 0), (2, 9, 0)
-    assert seen(images, [0], *ahead) == [True, True, True, False, False]
+    assert visibility(images, [0], *ahead) == [True, True, True, False, False]
     both = (5, 0, 0), (5, -8, 0), (0.5, 9, 0)  # the second: by the second alone
-    assert seen(images, [0, 1], *both) == [True, False, False]
+    assert visibility(images, [0, 1], *both) == [True, False, False]
     points = np.random.default_rng(0).uniform([5, -2, -2], [7, 2, 2], (300, 3))
     begin = views(wide, *looks, points=points)  # at 5 m
-    assert seen(begin, [0], (3, 0, 0), (5, 0, 0), (3, 3, 3)) == [False, True, True]
+    assert visibility(begin, [0], (3, 0, 0), (5, 0, 0), (3, 3, 3)) == [
+        False,
+        True,
+        True,
+    ]
 
 
 def test_the_road_beneath_a_camera_is_seen_from_behind():
@@ -252,7 +258,7 @@ def test_the_road_beneath_a_camera_is_seen_from_behind():
     looks = [((x, 0, 0), (x + 1, 0, 0)) for x in (0, -4, -8)]
     images = views(from_fov(16, 16, 90.0), *looks, points=road)
     beneath, before = (0.5, 0, -2), (1, 0, 0)  # of the first camera
-    assert seen(images, [0, 1, 2], beneath, before) == [True, False]
+    assert visibility(images, [0, 1, 2], beneath, before) == [True, False]
 
 
 def test_cells_at_the_rim_of_a_distorted_image_are_seen():
@@ -263,7 +269,7 @@ def test_cells_at_the_rim_of_a_distorted_image_are_seen():
     corner = cv2.undistortPoints(first, matrix, np.array(lens.distortion))[0, 0]
     x, y = 9 * corner  # right and down of the axis
     images = views(lens, ((0, 0, 0), (1, 0, 0)))
-    assert seen(images, [0], (9, -x, -y), edge=200) == [True]
+    assert visibility(images, [0], (9, -x, -y), edge=200) == [True]
 
 
 def test_running_occupancy_finds_the_dense_half():

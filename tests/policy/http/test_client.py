@@ -20,18 +20,18 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 def handler(*answers):
     """Make a handler that answers each request with the next status and body."""
-    queue, seen = list(answers), []
+    queue, requests = list(answers), []
 
     class Handler(BaseHTTPRequestHandler):
         def do_POST(self):
             body = self.rfile.read(int(self.headers["Content-Length"]))
-            seen.append((self.headers, body))
+            requests.append((self.headers, body))
             status, text = queue.pop(0)
             self.send_response(status)
             self.end_headers()
             self.wfile.write(text)
 
-    return Handler, seen
+    return Handler, requests
 
 
 GOOD = (200, b'{"control": [0.5, -0.25]}')
@@ -39,28 +39,30 @@ GOOD = (200, b'{"control": [0.5, -0.25]}')
 
 def test_http_protocol_and_retries(served, rng, monkeypatch):
     monkeypatch.setattr("mi_nerfattack.policy.http.client.PAUSE_S", 0.01)
-    made, seen = handler((503, b""), GOOD, (502, b""), GOOD)
+    made, requests = handler((503, b""), GOOD, (502, b""), GOOD)
     policy = HttpPolicy(served(made), retries=1, action=Action(scale=2.0))
     image, memory = camera(2, rng), policy.initial_memory(2)
     for step in range(2):
         control, memory = policy.step(image, [0, 2], memory)
         np.testing.assert_array_equal(control, [1.0, -0.5])
-        headers, body = seen[-1]
+        headers, body = requests[-1]
         assert (headers["X-Goal"], headers["X-Step"]) == ("0,2", str(step))
-    assert body == seen[-2][1] and body.startswith(b"\x93NUMPY") and len(seen) == 4
+    assert (
+        body == requests[-2][1] and body.startswith(b"\x93NUMPY") and len(requests) == 4
+    )
     sent = np.frombuffer(body[-2 * 66 * 200 * 3 * 4 :], "f4").reshape(2, 3, 66, 200)
     np.testing.assert_array_equal(sent, image.numpy().transpose(0, 3, 1, 2))
 
 
-def raw_handler(*parts, pause=0.0):
+def raw_handler(*pieces, pause=0.0):
     """Make a handler that sends bytes as they are, the last of them again and again."""
 
     class Raw(BaseHTTPRequestHandler):
         def do_POST(self):
             self.rfile.read(int(self.headers["Content-Length"]))
             try:
-                for part in [*parts[:-1], *parts[-1:] * (100 if pause else 1)]:
-                    self.wfile.write(part)
+                for piece in [*pieces[:-1], *pieces[-1:] * (100 if pause else 1)]:
+                    self.wfile.write(piece)
                     threading.Event().wait(pause)
             except OSError:
                 pass  # the client has gone
@@ -99,7 +101,7 @@ def test_answers_are_strict(answer, message, served, rng, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "parts",
+    "pieces",
     [
         [HEAD + b"X-Long: ", b"a"],
         [b"HTTP/1.1 100 Continue\r\n\r\n"],
@@ -108,8 +110,8 @@ def test_answers_are_strict(answer, message, served, rng, monkeypatch):
     ],
     ids=["headers", "continue", "extensions", "body"],
 )
-def test_the_timeout_is_of_everything_that_comes(parts, served, rng):
-    url = served(raw_handler(*parts, pause=0.03))  # each in time
+def test_the_timeout_is_of_everything_that_comes(pieces, served, rng):
+    url = served(raw_handler(*pieces, pause=0.03))  # each in time
     before = time.monotonic()
     with pytest.raises(InputError, match="0.2 s, after 1 attempts"):
         HttpPolicy(url, 0.2, retries=0).control(camera(1, rng), 0)
@@ -126,8 +128,8 @@ def test_the_timeout_is_of_a_connection_to_all_addresses(rng, monkeypatch):
         raise TimeoutError
 
     monkeypatch.setattr(socket, "create_connection", connect)
-    found = [(2, 1, 6, "", (f"192.0.2.{i}", 80)) for i in range(5)]
-    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+    addresses = [(2, 1, 6, "", (f"192.0.2.{i}", 80)) for i in range(5)]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: addresses)
     before = time.monotonic()
     with pytest.raises(InputError, match="0.1 s, after 1 attempts"):
         HttpPolicy("http://a", 0.1, retries=0).control(camera(1, rng), 0)

@@ -214,8 +214,8 @@ HEADERS = {
 def request(body: bytes, **headers: object) -> bytes:
     """Return the bytes of a request; a header that is None is left out."""
     named = {key.replace("_", "-"): value for key, value in headers.items()}
-    found = {**HEADERS, "Content-Length": len(body), **named}
-    lines = [f"{key}: {value}" for key, value in found.items() if value is not None]
+    fields = {**HEADERS, "Content-Length": len(body), **named}
+    lines = [f"{key}: {value}" for key, value in fields.items() if value is not None]
     return "\r\n".join(["POST / HTTP/1.1", *lines, "", ""]).encode() + body
 
 
@@ -266,6 +266,6 @@ def test_places_to_listen():
         ("[::]", ("::", 8000, False)),
         ("car.local:9000", ("car.local", 9000, False)),
     ):
-        found = Endpoint.parse(text)
-        assert (found.host, found.port, found.is_loopback) == expected
-        assert Endpoint.parse(str(found)) == found
+        endpoint = Endpoint.parse(text)
+        assert (endpoint.host, endpoint.port, endpoint.is_loopback) == expected
+        assert Endpoint.parse(str(endpoint)) == endpoint

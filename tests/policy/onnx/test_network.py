@@ -23,8 +23,8 @@ def single(operator, x, constants=(), opset=17, extra=(), **attributes):
     values.pop("", None)
     node = helper.make_node(operator, ["x", *names], ["y", *extra], **attributes)
     kind = helper.np_dtype_to_tensor_dtype(x.dtype)
-    found = FLOAT if operator == "OneHot" else kind
-    outputs = {name: (found, None) for name in ("y", *extra)}
+    output_kind = FLOAT if operator == "OneHot" else kind
+    outputs = {name: (output_kind, None) for name in ("y", *extra)}
     check(model([node], {"x": (kind, x.shape)}, outputs, values, opset), x)
 
 

@@ -46,9 +46,9 @@ def packed(image: np.ndarray) -> np.ndarray:
 def test_images_are_packed(rng):
     image = rng.random((2, 6, 8, 3))
     planes = torch.tensor(image.transpose(0, 3, 1, 2), requires_grad=True)
-    found = PackYuv().apply(planes)
-    wanted = [packed(one) for one in image]
-    np.testing.assert_allclose(found.detach(), wanted, atol=1e-9)
+    actual = PackYuv().apply(planes)
+    expected = [packed(one) for one in image]
+    np.testing.assert_allclose(actual.detach(), expected, atol=1e-9)
     assert torch.autograd.gradcheck(PackYuv().apply, planes)
     white = PackYuv().apply(torch.ones(1, 3, 2, 2, dtype=torch.float64))
     np.testing.assert_allclose(white.flatten(), [235] * 4 + [128] * 2, atol=0.1)
@@ -81,12 +81,12 @@ class Runtime:
         self.features.append(vector[0, slice(*pair.features)])
         chosen = self.features[:: -self.stride][: pair.count][::-1]
         shapes = {item.name: item.shape for item in self.policy.get_inputs()}
-        told = {name: np.zeros(shape, "f4") for name, shape in shapes.items()}
-        told["features_buffer"] = np.float32(chosen)[None]
-        told["traffic_convention"] = np.float32([self.traffic])
-        if "lateral_control_params" in told:
-            told["lateral_control_params"] = np.float32([[speed, self.delay]])
-        (vector,) = self.policy.run(None, told)
+        inputs = {name: np.zeros(shape, "f4") for name, shape in shapes.items()}
+        inputs["features_buffer"] = np.float32(chosen)[None]
+        inputs["traffic_convention"] = np.float32([self.traffic])
+        if "lateral_control_params" in inputs:
+            inputs["lateral_control_params"] = np.float32([[speed, self.delay]])
+        (vector,) = self.policy.run(None, inputs)
         plan = vector[0, slice(*pair.plan)]
         if pair.hypotheses:
             rows = plan.reshape(pair.hypotheses, 991)
@@ -114,17 +114,17 @@ def test_drives_are_those_of_onnxruntime(pair, keys, tmp_path, rng, variant):
     order = keys.get("stride", 4), keys.get("frame_stride", 4)
     delay = keys.get("steering_delay_s", 0.2)
     twins = [Runtime(pair, *order, traffic, delay) for _ in range(2)]
-    memory, seen = policy.initial_memory(2), []
+    memory, controls = policy.initial_memory(2), []
     for _ in range(7):
         frame = rng.integers(0, 256, (2, 18, 44, 3)).astype("f4") / 255
         speed = np.array([6.0, 9.0])
         numbers = mi.TensorXf(speed[:, None])
         control, memory = policy.step(mi.TensorXf(frame), 0, memory, numbers)
         points = [t.step(f, v) for t, f, v in zip(twins, frame, speed, strict=True)]
-        wanted = follow.follow(torch.tensor(np.array(points)), torch.tensor(speed))
-        np.testing.assert_allclose(control, wanted, rtol=2e-3, atol=2e-3)
-        seen.append(np.array(control))
-    assert np.std(seen) > 0.02  # which images change
+        expected = follow.follow(torch.tensor(np.array(points)), torch.tensor(speed))
+        np.testing.assert_allclose(control, expected, rtol=2e-3, atol=2e-3)
+        controls.append(np.array(control))
+    assert np.std(controls) > 0.02  # which images change
 
 
 def test_shapes_of_the_real_files(rng):
@@ -132,10 +132,10 @@ def test_shapes_of_the_real_files(rng):
     assert module.recurrent == ((-1, 96, 512),) and module.batch == 1
     images = (torch.rand(1, 12, 128, 256) * 255 for _ in range(2))
     with torch.no_grad():
-        found, after = module(*images, torch.ones(1, 1), torch.zeros(1, 96, 512))
-    assert found.shape == (1, 32, 2) and after.shape == (1, 96, 512)
+        positions, after = module(*images, torch.ones(1, 1), torch.zeros(1, 96, 512))
+    assert positions.shape == (1, 32, 2) and after.shape == (1, 96, 512)
     assert after[0, -1].abs().max() > 0 and not after[0, :-1].any()
-    assert 0.5 * SPEED < found[0, -1, 0] / 10 < 1.5 * SPEED
+    assert 0.5 * SPEED < positions[0, -1, 0] / 10 < 1.5 * SPEED
 
 
 def leaves(module: Openpilot, rng, rows: int, columns: int) -> list[torch.Tensor]:
@@ -159,8 +159,8 @@ def test_derivatives_by_each_argument_through_the_history(part, rng):
         *pictures, history = arguments
         total = 0
         for period in range(3):
-            found, history = module(*pictures, history)
-            total = total + (weight[period] * found).sum()
+            positions, history = module(*pictures, history)
+            total = total + (weight[period] * positions).sum()
         return total
 
     leaf = start[part].clone().requires_grad_()
@@ -171,15 +171,15 @@ def test_derivatives_by_each_argument_through_the_history(part, rng):
 
 def test_bytes_are_rounded_straight_through(rng):
     start = leaves(NEW.module(), rng, *NEW.size)
-    found, exact = [], []
-    for pair, answers in ((NEW, found), (replace(NEW, images=FLOAT), exact)):
+    rounded, exact = [], []
+    for pair, answers in ((NEW, rounded), (replace(NEW, images=FLOAT), exact)):
         module = pair.module().double()
         pictures = [x.round() if pair.images == FLOAT else x.clone() for x in start[:2]]
         pictures = [x.requires_grad_() for x in pictures]
         positions, _ = module(*pictures, *start[2:])
         positions.sum().backward()
         answers += [positions.detach(), *(x.grad for x in pictures)]
-    for one, other in zip(found, exact, strict=True):
+    for one, other in zip(rounded, exact, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
         assert one.abs().max() > 0
 

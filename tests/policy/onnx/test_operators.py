@@ -15,13 +15,13 @@ INT64, BOOL = TensorProto.INT64, TensorProto.BOOL
 KINDS = {"f": FLOAT, "i": INT64, "b": BOOL}
 
 
-def one(operator, x, constants=(), opset=18, found=None, extra=(), **attributes):
+def one(operator, x, constants=(), opset=18, output_kind=None, extra=(), **attributes):
     """Make a model of an operator of x, whose further inputs are constant."""
     names = [f"c{i}" if c is not None else "" for i, c in enumerate(constants)]
     values = {n: c for n, c in zip(names, constants, strict=True) if n}
     node = helper.make_node(operator, ["x", *names], ["y", *extra], **attributes)
     kind = KINDS[x.dtype.kind]
-    outputs = {"y": (found or kind, None), **{n: (INT64, None) for n in extra}}
+    outputs = {"y": (output_kind or kind, None), **{n: (INT64, None) for n in extra}}
     return model([node], {"x": (kind, x.shape)}, outputs, values, opset)
 
 
@@ -110,17 +110,17 @@ SMOOTH = [
 FLAT = [
     *((name, X, [], {}) for name in ("Ceil", "Floor", "Sign")),
     ("Round", np.float32([-1.5, -0.5, 0.4, 0.5, 1.5, 2.5]), [], {}),
-    ("IsNaN", np.float32([0, np.nan, np.inf]), [], {"found": BOOL}),
-    ("IsInf", np.float32([0, np.nan, -np.inf]), [], {"found": BOOL}),
-    ("GreaterOrEqual", X, [X[:1]], {"found": BOOL}),
-    ("LessOrEqual", X, [X[:1]], {"found": BOOL}),
+    ("IsNaN", np.float32([0, np.nan, np.inf]), [], {"output_kind": BOOL}),
+    ("IsInf", np.float32([0, np.nan, -np.inf]), [], {"output_kind": BOOL}),
+    ("GreaterOrEqual", X, [X[:1]], {"output_kind": BOOL}),
+    ("LessOrEqual", X, [X[:1]], {"output_kind": BOOL}),
     *((name, X > 0, [X[:1] > 0.5], {}) for name in ("And", "Or", "Xor")),
     ("Not", X > 0, [], {}),
     ("Mod", integers(-7, 7, 5), [integers(3, -3, 2)], {}),
-    ("ArgMax", X, [], {"axis": 1, "found": INT64}),
-    ("ArgMin", X, [], {"axis": -1, "keepdims": 0, "found": INT64}),
-    ("NonZero", X > 0.5, [], {"found": INT64}),
-    ("Size", X, [], {"found": INT64}),
+    ("ArgMax", X, [], {"axis": 1, "output_kind": INT64}),
+    ("ArgMin", X, [], {"axis": -1, "keepdims": 0, "output_kind": INT64}),
+    ("NonZero", X > 0.5, [], {"output_kind": INT64}),
+    ("Size", X, [], {"output_kind": INT64}),
     ("Range", integers(3), [np.array(-5), np.array(-2)], {}),
     ("Range", np.float32([0.5]), [np.float32(2), np.float32(0.4)], {}),
     ("Range", integers(3), [np.array(1), np.array(1)], {}),
@@ -144,9 +144,9 @@ def test_derivatives(operator, x, constants, options):
     leaf = torch.tensor(x, dtype=torch.float64, requires_grad=True)
 
     def weighed(values):
-        found = network(values)[0]
-        weights = torch.linspace(0.5, 1.7, found.numel(), dtype=torch.float64)
-        return (found * weights.reshape(found.shape)).sum()
+        output = network(values)[0]
+        weights = torch.linspace(0.5, 1.7, output.numel(), dtype=torch.float64)
+        return (output * weights.reshape(output.shape)).sum()
 
     assert torch.autograd.gradcheck(weighed, leaf, fast_mode=True, atol=1e-6)
 

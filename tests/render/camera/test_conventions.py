@@ -149,10 +149,10 @@ def test_a_pose_scales_then_turns_then_moves():
 
 def test_a_rounded_pose_becomes_the_nearest_rigid_one():
     rounded = moving(np.array([0.7]))[0].round(3)
-    found = nearest_rigid(rounded, "a.json")
-    np.testing.assert_allclose(found[:3, :3], polar(rounded[:3, :3])[0], atol=1e-12)
-    np.testing.assert_array_equal(found[:, 3], rounded[:, 3])
-    np.testing.assert_array_equal(found[3], [0, 0, 0, 1])
+    pose = nearest_rigid(rounded, "a.json")
+    np.testing.assert_allclose(pose[:3, :3], polar(rounded[:3, :3])[0], atol=1e-12)
+    np.testing.assert_array_equal(pose[:, 3], rounded[:, 3])
+    np.testing.assert_array_equal(pose[3], [0, 0, 0, 1])
 
 
 # Poses between tracked ones, against a motion whose formula is known

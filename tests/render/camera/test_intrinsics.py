@@ -179,12 +179,12 @@ def test_srgb_round_trip_and_numpy_agree():
         dr.linear_to_srgb(mi.Float(values)),
         dr.srgb_to_linear(mi.Float(values)),
     )
-    for found, expected in (
+    for actual, expected in (
         (dr.srgb_to_linear(encoded), values),
         (encoded, colour.linear_to_srgb_numpy(values.astype(float))),
         (decoded, colour.srgb_to_linear_numpy(values.astype(float))),
     ):
-        np.testing.assert_allclose(found, expected, atol=1e-6)
+        np.testing.assert_allclose(actual, expected, atol=1e-6)
 
 
 # Lenses with distortion, also fisheyes
@@ -211,8 +211,8 @@ def test_opencv_projects_rays_back_to_their_pixels(camera):
     points = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 1, 3)
     project = cv2.fisheye.projectPoints if camera.is_fisheye else cv2.projectPoints
     zero, coefficients = np.zeros(3), np.array(camera.distortion[:4])
-    found, _ = project(points, zero, zero, matrix, coefficients)
-    np.testing.assert_allclose(found[:, 0].T, pixels(camera), atol=1e-6)
+    projected, _ = project(points, zero, zero, matrix, coefficients)
+    np.testing.assert_allclose(projected[:, 0].T, pixels(camera), atol=1e-6)
     # distort is the same projection, and jacobian its derivative
     bent = np.reshape(distortion.distort(x, y, *camera.distortion), (2, -1))
     scaled = bent * [[camera.fx], [camera.fy]] + [[camera.cx], [camera.cy]]
@@ -229,30 +229,32 @@ def test_opencv_projects_rays_back_to_their_pixels(camera):
 
 def test_a_fisheye_shows_its_middle_as_it_is():
     middle = np.zeros(1)
-    found = distortion.jacobian(middle, middle, *NARROW.distortion)
-    np.testing.assert_allclose(np.ravel(found), [1, 0, 1, 1])
+    jacobian = distortion.jacobian(middle, middle, *NARROW.distortion)
+    np.testing.assert_allclose(np.ravel(jacobian), [1, 0, 1, 1])
 
 
 def test_a_lens_far_out_of_true_is_undone_to_the_last_digits():
     x, y = np.meshgrid(np.linspace(-0.6, 0.6, 9), np.linspace(-0.4, 0.4, 7))
     coefficients = -0.2, 0.05, 0.06, -0.05
     bent = distortion.distort(x, y, *coefficients)
-    found = distortion.undistort(*bent, *coefficients)
-    np.testing.assert_allclose(found, (x, y), rtol=0, atol=1e-13)
+    slopes = distortion.undistort(*bent, *coefficients)
+    np.testing.assert_allclose(slopes, (x, y), rtol=0, atol=1e-13)
 
 
 def test_cameras_of_one_lens_are_told_apart():
     cameras = [RADIAL, replace(RADIAL, fx=40.0, k1=0.1)]
     place = np.array([[10.0, 20, 30], [5, 9, 30]])
     index = [1, 0, 1]
-    _, found = lens.lens_rays(
+    _, ray_directions = lens.lens_rays(
         lens.Lens(cameras).of(mi.UInt32(index)),
         mi.Point3f(0),
         tuple(mi.Vector3f(*row) for row in np.eye(3).tolist()),
         mi.Point2f(place.astype(np.float32)),
     )
     both = np.stack([directions(camera, *place) for camera in cameras])
-    np.testing.assert_allclose(found.numpy().T, both[index, range(3)], atol=2e-6)
+    np.testing.assert_allclose(
+        ray_directions.numpy().T, both[index, range(3)], atol=2e-6
+    )
 
 
 # Files, and what is refused

@@ -21,18 +21,20 @@ def test_a_map_to_scale_is_what_the_camera_sees():
     on_map = overhead.to_px(POINTS)
     np.testing.assert_allclose(on_map, [[5, 55], [105, 35], [40, 5]], atol=1e-9)
     pose, ground = overhead.camera_to_world, np.pad(POINTS, ((0, 0), (0, 1)))
-    found = seen_at(overhead.camera, pose, ground)
-    np.testing.assert_allclose(found, on_map, atol=1e-6)
+    projected = seen_at(overhead.camera, pose, ground)
+    np.testing.assert_allclose(projected, on_map, atol=1e-6)
     raised = seen_at(overhead.camera, pose, ground + [0, 0, 10.0])
-    growth = (raised - [55, 30]) / (found - [55, 30])
+    growth = (raised - [55, 30]) / (projected - [55, 30])
     np.testing.assert_allclose(growth, 1 / (1 - 10 / overhead.height_m))
 
 
 def test_what_is_high_moves_outwards_by_a_28th_of_its_height_at_most():
     overhead = Overhead((-50.0, -50.0), 1.0, 100, 100)
     corner = np.array([[50.0, 50.0, 0.0], [50.0, 50.0, 10.0]])
-    seen = seen_at(overhead.camera, overhead.camera_to_world, corner)
-    assert np.linalg.norm(seen[1] - seen[0]) == pytest.approx(10 / 28, rel=0.01)
+    projected = seen_at(overhead.camera, overhead.camera_to_world, corner)
+    assert np.linalg.norm(projected[1] - projected[0]) == pytest.approx(
+        10 / 28, rel=0.01
+    )
 
 
 def test_from_behind_the_car_is_in_the_middle_and_the_road_ahead():

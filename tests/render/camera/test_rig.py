@@ -36,14 +36,14 @@ def test_images_lie_side_by_side_and_are_black_below(rng):
     assert frame.shape == (2, 5, 6, 3) and RIG.size == (6, 5)
     assert RIG.columns == {"front": slice(0, 4), "left": slice(4, 6)}
     assert not frame[:, 3:, :4].any()
-    for found in (
+    for split_images in (
         RIG.split(frame),
         {k: v.numpy() for k, v in RIG.split(torch.tensor(frame)).items()},
         {k: v.numpy() for k, v in RIG.split(mi.TensorXf(frame)).items()},
     ):
-        assert list(found) == ["front", "left"]
+        assert list(split_images) == ["front", "left"]
         for name, image in images.items():
-            assert np.array_equal(found[name], image)
+            assert np.array_equal(split_images[name], image)
     together = side_by_side([mi.TensorXf(x) for x in images.values()], RIG.layout)
     assert np.array_equal(together.numpy(), frame)
 
@@ -53,11 +53,11 @@ def test_derivatives_pass_when_a_frame_is_taken_apart_and_put_together(rng):
     inside = RIG.join({k: np.ones_like(v) for k, v in pictures(rng).items()})
     value = mi.TensorXf(frame)
     dr.enable_grad(value)
-    parts = list(RIG.split(value).values())
-    shown = side_by_side(parts, RIG.layout)
+    images = list(RIG.split(value).values())
+    shown = side_by_side(images, RIG.layout)
     dr.backward(dr.sum(shown.array * mi.Float(weight.ravel().astype(np.float32))))
-    found = dr.grad(value).numpy()
-    np.testing.assert_allclose(found, weight * inside, rtol=1e-6)
+    gradient = dr.grad(value).numpy()
+    np.testing.assert_allclose(gradient, weight * inside, rtol=1e-6)
     value = torch.tensor(frame, requires_grad=True)
     RIG.split(value)["left"].sum().backward()
     assert value.grad is not None and value.grad.sum() == 2 * 2 * 5 * 3
@@ -82,13 +82,13 @@ def test_a_disturbance_ends_where_an_image_does(rng):
     disturbance = Disturbance(exposure_ev_sd=0.5, blur_px_sd=1.0, noise_sd=0.02, seed=3)
     images = pictures(rng)
     shown = disturbance.apply(mi.TensorXf(RIG.join(images)), 4, RIG.layout)
-    found = RIG.split(shown.numpy())
+    disturbed = RIG.split(shown.numpy())
     # the first image is what it is without the second one, and so is the second
     alone = disturbance.apply(mi.TensorXf(images["front"]), 4).numpy()
-    assert np.array_equal(found["front"], alone)
+    assert np.array_equal(disturbed["front"], alone)
     images["front"] = np.zeros_like(images["front"])
     again = disturbance.apply(mi.TensorXf(RIG.join(images)), 4, RIG.layout).numpy()
-    assert np.array_equal(RIG.split(again)["left"], found["left"])
+    assert np.array_equal(RIG.split(again)["left"], disturbed["left"])
     assert not again[:, 3:, :4].any()  # nor has the frame noise where no image is
     plain = Disturbance(noise_sd=0.02, seed=3)
     grey = RIG.join({k: np.full_like(v, 0.5) for k, v in images.items()})
@@ -106,9 +106,9 @@ def test_the_derivative_of_a_disturbed_frame(rng):
         shown = disturbance.apply(moved, 0, RIG.layout)
         return float((shown.numpy() * weight.numpy()).astype(float).sum())
 
-    found = disturbance.vjp(mi.TensorXf(frame), 0, weight, RIG.layout).numpy()
+    gradient = disturbance.vjp(mi.TensorXf(frame), 0, weight, RIG.layout).numpy()
     expected = (value(1e-2) - value(-1e-2)) / 2e-2
-    assert float((found * direction).sum()) == pytest.approx(expected, rel=5e-3)
+    assert float((gradient * direction).sum()) == pytest.approx(expected, rel=5e-3)
 
 
 test_refused = refusals(

@@ -46,9 +46,11 @@ def box(tmp_path: Path, variant: str) -> dict[str, Any]:
     return relit(tmp_path, small.homogeneous(1e4, RAW))
 
 
-def scene(seeing: dict[str, Any], eye=(3.0, 0.0, 0.0), fov=10, **more: Any) -> mi.Scene:
+def scene(
+    seeing: dict[str, Any], eye=(3.0, 0.0, 0.0), fov=10, **world: Any
+) -> mi.Scene:
     """Load a scene of 8 x 8 pixels that looks at the origin."""
-    return small.load(seeing, more, eye=eye, fov=fov, width=8, height=8)
+    return small.load(seeing, world, eye=eye, fov=fov, width=8, height=8)
 
 
 def sun(x: float, y: float, z: float) -> dict[str, Any]:
@@ -70,8 +72,8 @@ def colour(loaded: mi.Scene, spp: int = 4) -> np.ndarray:
 @pytest.mark.parametrize("angle_deg", [0, 60, 85, 180])
 def test_sun_on_a_box_is_lamberts_law(box, angle_deg: float) -> None:
     c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
-    found = colour(scene({"object": box}, light=sun(-c, 0.0, -s)))
-    np.testing.assert_allclose(found, RHO * max(c, 0) / np.pi * SUN_RGB, rtol=1e-2)
+    radiance = colour(scene({"object": box}, light=sun(-c, 0.0, -s)))
+    np.testing.assert_allclose(radiance, RHO * max(c, 0) / np.pi * SUN_RGB, rtol=1e-2)
 
 
 @pytest.mark.parametrize("each_variant", RGB + SPECTRAL + MONO, indirect=True)
@@ -83,8 +85,8 @@ def test_every_variant(each_variant: str, tmp_path: Path) -> None:
         expected = RHO / np.pi * SUN_RGB
         if mi.is_monochromatic:
             expected = expected @ [0.212671, 0.71516, 0.072169]
-        found = colour(scene({"object": box}, light=sun(-1, 0, 0)))
-        np.testing.assert_allclose(found, expected, rtol=1e-2)
+        radiance = colour(scene({"object": box}, light=sun(-1, 0, 0)))
+        np.testing.assert_allclose(radiance, expected, rtol=1e-2)
 
 
 def test_walls_and_other_objects_block_the_sun(box) -> None:
@@ -100,14 +102,14 @@ def test_light_passes_what_lets_it_through(box) -> None:
     floor = {"type": "rectangle", "to_world": T().translate([0, 0, -1]).scale(9)}
     lamps = {"light": sun(-1, 0, -1), "floor": floor}
     inner = {"type": "sphere", "radius": 4.0, "bsdf": {"type": "null"}}
-    seen = []
+    frames = []
     for shells in ({}, {"inner": inner, "outer": {**inner, "radius": 30.0}}):
         behind = {"type": "volpath", "max_depth": 2}
         loaded = scene(
             {"object": box, "behind": behind}, (-2, 4, 9), 35, **lamps, **shells
         )
-        seen.append(np.array(mi.render(loaded, spp=64))[..., :3])
-    bare, inside = seen
+        frames.append(np.array(mi.render(loaded, spp=64))[..., :3])
+    bare, inside = frames
     assert bare.min() < 0.01 < 0.1 < np.median(bare)  # a shadow on the bright floor
     np.testing.assert_allclose(inside, bare, rtol=0.03, atol=0.003)
 
@@ -152,11 +154,11 @@ def test_a_shadow_falls_where_geometry_says() -> None:
     x, y = np.meshgrid(np.linspace(-5, 2, 29) + 0.11, np.linspace(-2, 2, 17) + 0.07)
     # The last of the rays misses the ground, |x| < 8, and keeps its colour.
     x, y = np.append(x, 20), np.append(y, 0)
-    found = ground_gain(x, y, 1, sun=sun(-1, 0, -1))
+    gain = ground_gain(x, y, 1, sun=sun(-1, 0, -1))
     shaded = (x > -4) & (x < 0) & (np.abs(y) < 1)
     # Shadow rays start 2 steps of 0.08 m above the ground, so sideways 0.16 m.
     edge = (np.abs(x) < 0.2) | (np.abs(x + 4) < 0.2) | (np.abs(np.abs(y) - 1) < 0.05)
-    for channel in found.T:
+    for channel in gain.T:
         np.testing.assert_allclose(channel[~edge], 1.0 - shaded[~edge], atol=1e-5)
 
 
@@ -179,11 +181,11 @@ def corner_factor(a: float) -> float:
 def test_sun_and_sky_in_a_shadow() -> None:
     # Under the middle of the box only its lower face is seen; the sun stands above.
     zeros = np.zeros(256)
-    found = ground_gain(zeros, zeros, 64, sun=sun(0, 0, -1), sky=sky(0.3)).mean(0)
+    gain = ground_gain(zeros, zeros, 64, sun=sun(0, 0, -1), sky=sky(0.3)).mean(0)
     height = 1 - 0.16  # of the box above where shadow rays start
     light = np.pi * 0.3
-    wanted = light * (1 - 4 * corner_factor(1 / height)) / (light + SUN_RGB)
-    np.testing.assert_allclose(found, wanted, rtol=2e-2)
+    expected = light * (1 - 4 * corner_factor(1 / height)) / (light + SUN_RGB)
+    np.testing.assert_allclose(gain, expected, rtol=2e-2)
 
 
 def test_surfaces_behind_are_shaded_too(box) -> None:
@@ -193,9 +195,9 @@ def test_surfaces_behind_are_shaded_too(box) -> None:
     hovering = {**box, "to_world": T().translate([0, 0, 2])}
     seeing = {"object": hovering, "behind": {"type": "direct"}, "relit_samples": 64}
     world = {"ground": ground, "sun": sun(0, 0, -1), "sky": sky(0.3)}
-    found = colour(scene(seeing, (0, -6, 0.5), 0.05, **world), 256)
-    wanted = 0.5 * 0.3 * (1 - 4 * corner_factor(1.0))
-    np.testing.assert_allclose(found, wanted, rtol=2e-2)
+    radiance = colour(scene(seeing, (0, -6, 0.5), 0.05, **world), 256)
+    expected = 0.5 * 0.3 * (1 - 4 * corner_factor(1.0))
+    np.testing.assert_allclose(radiance, expected, rtol=2e-2)
 
 
 def test_lights_and_sky_behind_are_not_shaded(box) -> None:
@@ -305,13 +307,13 @@ SLOW = [(name, "object.colour", "interleaved") for name in (*RGB, *SPECTRAL, *MO
     indirect=["each_variant"],
 )
 def test_gradients(each_variant, tmp_path: Path, rng, name, composite) -> None:
-    found = problem(tmp_path, rng, name, composite)
-    found.check([rng.normal(0, 1, found.base.shape)])
+    derivatives = problem(tmp_path, rng, name, composite)
+    derivatives.check([rng.normal(0, 1, derivatives.base.shape)])
 
 
 @pytest.mark.usefixtures("variant")
 @pytest.mark.parametrize("name", ["object.density", "other.density"])
 def test_what_changes_the_light_is_refused(tmp_path: Path, rng, name: str) -> None:
-    found = problem(tmp_path, rng, name, "interleaved")
+    derivatives = problem(tmp_path, rng, name, "interleaved")
     with pytest.raises(Exception, match="set relit to false"):
-        found.gradient()
+        derivatives.gradient()

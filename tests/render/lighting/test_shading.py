@@ -49,8 +49,8 @@ def irradiance(normal: np.ndarray, sun: Sunlight) -> np.ndarray:
         return (1 + z) / 2 + ground * (1 - z) / 2
 
     cosine = max(0.0, float(normal @ towards))
-    found = direct * cosine * black_body(sun.colour_k) + diffuse(normal[2])
-    return found / (direct + diffuse(towards[2]))
+    side_irradiance = direct * cosine * black_body(sun.colour_k) + diffuse(normal[2])
+    return side_irradiance / (direct + diffuse(towards[2]))
 
 
 def received(light: Light, normal: np.ndarray) -> np.ndarray:
@@ -104,13 +104,13 @@ def test_the_sides_of_a_box_get_their_share_of_sun_and_sky():
     for rotation in (STILL, turned):
         (row,) = reflectances.rows([SUN], rotation)
         expected = np.array([irradiance(rotation @ side, SUN) for side in SIDES])
-        found = factors(reflectances, middles(field), row)
+        light = factors(reflectances, middles(field), row)
         assert expected.max() > 2.5 * expected.min()
-        assert found == pytest.approx(expected, rel=0.04)
+        assert light == pytest.approx(expected, rel=0.04)
         (row,) = renders.rows([SUN], rotation)
         before = np.array([received(Lighting().light(), side) for side in SIDES])
-        found = factors(renders, middles(field), row)
-        assert found == pytest.approx(expected / before, rel=0.04)
+        light = factors(renders, middles(field), row)
+        assert light == pytest.approx(expected / before, rel=0.04)
 
 
 def test_an_object_shades_itself():
@@ -153,8 +153,8 @@ def test_headers_tell_the_light_of_the_capture():
         field.info = info
         maps = light_maps(field)
         (row,) = maps.rows([SUN], STILL)
-        found = factors(maps, middles(field)[4:], row)[0]
-        assert found == pytest.approx(expected / divisor, rel=0.04)
+        light = factors(maps, middles(field)[4:], row)[0]
+        assert light == pytest.approx(expected / divisor, rel=0.04)
 
 
 def test_rays_have_derivatives_through_a_map(rng):
@@ -172,17 +172,17 @@ def test_rays_have_derivatives_through_a_map(rng):
         moved = mi.Point3f(*(mi.Float(x.tolist()) for x in origin + step * along))
         return Rays(moved, mi.Vector3f(-1, 0, 0), gains=[gain])
 
-    def seen(step: float) -> March:
+    def integrals(step: float) -> March:
         return march(*rays(step).light([posed]), rays(step))
 
     (lit,) = rays(0.0).light([posed])
     cotangent = March(mi.Color3f(*(mi.Float(x.tolist()) for x in weight)))
-    fixed = dr.ADMode.Backward, lit, rays(0.0), seen(0.0), cotangent
-    found = march_derivative(*fixed, with_rays=True)[1].origin.numpy()
+    fixed = dr.ADMode.Backward, lit, rays(0.0), integrals(0.0), cotangent
+    by_origin = march_derivative(*fixed, with_rays=True)[1].origin.numpy()
     h = 1e-3
-    change = seen(h).radiance.numpy() - seen(-h).radiance.numpy()
+    change = integrals(h).radiance.numpy() - integrals(-h).radiance.numpy()
     difference = (change / (2 * h) * weight).sum()
-    assert (found * along).sum() == pytest.approx(difference, rel=0.03)
+    assert (by_origin * along).sum() == pytest.approx(difference, rel=0.03)
     # the map's own slope is a good part of it
     lit.light_maps = None
     plain = march_derivative(*fixed, with_rays=True)[1].origin.numpy()

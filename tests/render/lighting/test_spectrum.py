@@ -32,7 +32,7 @@ def colour(values: np.ndarray) -> mi.Color3f:
     return result
 
 
-def seen(values: np.ndarray) -> np.ndarray:
+def observed_rgb(values: np.ndarray) -> np.ndarray:
     """Integrate an emission against the observer in float64: linear RGB."""
     nm = mi.Float(WAVELENGTHS.astype(np.float32))
     emitted = np.array(spectrum.emission(colour(values), mi.Spectrum(nm)))[0]
@@ -53,7 +53,7 @@ def test_basis_is_a_partition_into_reflectances() -> None:
 @pytest.mark.parametrize("values", COLOURS, ids=str)
 def test_every_colour_comes_back_from_its_spectrum(values: np.ndarray) -> None:
     spectrum.prepare()
-    np.testing.assert_allclose(seen(values), values, atol=1e-3 * values.max())
+    np.testing.assert_allclose(observed_rgb(values), values, atol=1e-3 * values.max())
 
 
 @pytest.mark.usefixtures("spectral")
@@ -67,8 +67,8 @@ def test_an_opaque_field_shows_its_colour_on_film(tmp_path: Path) -> None:
     view = {"eye": (3, 0, 0), "fov": 20, "width": 16, "height": 16}
     scene = small.load({"a": {"type": "grid_field", "filename": path}}, **view)
     image = np.array(mi.render(scene, spp=8192))
-    found = image[..., :3].mean((0, 1))
-    np.testing.assert_allclose(found, small.sigmoid_to_linear(raw), atol=1e-3)
+    radiance = image[..., :3].mean((0, 1))
+    np.testing.assert_allclose(radiance, small.sigmoid_to_linear(raw), atol=1e-3)
 
 
 @pytest.mark.usefixtures("spectral")
@@ -120,6 +120,6 @@ def test_mono_is_luminance_and_rgb_stays(each_variant: str) -> None:
         values @ [0.212671, 0.715160, 0.072169] if mi.is_monochromatic else values
     )
     for convert in (spectrum.emission, spectrum.reflectance):
-        found = np.array(convert(colour(values), mi.Color0f())).ravel()
+        actual = np.array(convert(colour(values), mi.Color0f())).ravel()
         rtol = 1e-5 if mi.is_monochromatic else 1e-6
-        np.testing.assert_allclose(found, expected, rtol=rtol)
+        np.testing.assert_allclose(actual, expected, rtol=rtol)

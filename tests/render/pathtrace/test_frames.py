@@ -56,8 +56,8 @@ def test_slab_has_its_closed_form_in_every_filter(tmp_path, rfilter):
     expected = dict.fromkeys("RGB", opacity * radiance)
     expected |= {"A": opacity, "Z": near + moment / opacity}
     for prefix in ("", "box."):
-        found = {name: channels[prefix + name][centre] for name in expected}
-        assert found == pytest.approx(expected, rel=1e-3)
+        actual = {name: channels[prefix + name][centre] for name in expected}
+        assert actual == pytest.approx(expected, rel=1e-3)
 
 
 def test_depth_is_infinite_where_there_is_nothing_and_never_nan(tmp_path):
@@ -66,10 +66,10 @@ def test_depth_is_infinite_where_there_is_nothing_and_never_nan(tmp_path):
     depth, opacity = channels["Z"], channels["A"]
     assert not np.isnan(depth).any()
     assert np.isinf(depth[0, 0]) and opacity[0, 0] == 0
-    seen = opacity > 0
-    np.testing.assert_array_equal(np.isinf(depth), ~seen)
+    hit = opacity > 0
+    np.testing.assert_array_equal(np.isinf(depth), ~hit)
     # between the nearest face and the farthest corner of the box
-    assert depth[seen].min() > 2 and depth[seen].max() < np.sqrt(4**2 + 2)
+    assert depth[hit].min() > 2 and depth[hit].max() < np.sqrt(4**2 + 2)
     write_frame(tmp_path / "a.exr", FrameRenderer(path).render(), "half")
 
 
@@ -233,11 +233,11 @@ def test_many_samples_are_the_mean_of_passes(tmp_path, monkeypatch):
         np.testing.assert_allclose(frame.channels[name], expected, rtol=1e-5)
     moments = [np.nan_to_num(m[..., 4], posinf=0) * m[..., 3] for m in images]
     opacity = np.mean([image[..., 3] for image in images], axis=0)
-    seen = opacity > 0
-    assert seen.any() and not seen.all()
-    depth = np.mean(moments, axis=0)[seen] / opacity[seen]
-    np.testing.assert_allclose(frame.channels["Z"][seen], depth, rtol=1e-5)
-    assert np.isinf(frame.channels["Z"][~seen]).all()
+    hit = opacity > 0
+    assert hit.any() and not hit.all()
+    depth = np.mean(moments, axis=0)[hit] / opacity[hit]
+    np.testing.assert_allclose(frame.channels["Z"][hit], depth, rtol=1e-5)
+    assert np.isinf(frame.channels["Z"][~hit]).all()
 
 
 def test_depths_of_passes_count_by_the_opacity_of_fields(tmp_path, monkeypatch):
@@ -338,16 +338,16 @@ def test_no_mean_of_a_bitmap_is_left_to_the_recording() -> None:
     ball = {"type": "sphere", "center": [0, 0, 4], "bsdf": bsdf}
     scene = mi.load_dict({"type": "scene", "ball": ball})
     nodes = mi.traverse(scene).hierarchy
-    (found,) = [node for node in nodes if node.class_name().startswith("Bitmap")]
-    assert found.mean().state == dr.VarState.Unevaluated
+    (bitmap,) = [node for node in nodes if node.class_name().startswith("Bitmap")]
+    assert bitmap.mean().state == dr.VarState.Unevaluated
     ViewRenderer(scene, from_fov(24, 16, 40.0))
-    assert found.mean().state == dr.VarState.Evaluated
+    assert bitmap.mean().state == dr.VarState.Evaluated
 
 
 def test_errors_of_an_integrator_are_its_own() -> None:
     """Not those of a recording."""
-    with pytest.raises(RuntimeError) as told:
+    with pytest.raises(RuntimeError) as caught:
         _renderer(fails=True).render(np.eye(4), 4, 0)
-    causes = str(told.value), str(told.value.__cause__)
+    causes = str(caught.value), str(caught.value.__cause__)
     assert any("of the plugin's own" in text for text in causes)
     assert "record" not in causes[0]

@@ -47,13 +47,13 @@ def test_the_ground_is_looked_for_every_half_metre() -> None:
     ("gap", "count"), [((3.8, 4.2), 0), ((3.8, 4.7), 1)], ids=["seam", "hole"]
 )
 def test_two_places_in_a_row_without_ground_are_a_hole(gap, count: int) -> None:
-    found = list(ground_findings(ROUTE, arc_lengths(0, 10), street(15, gap), "s.xml"))
-    assert len(found) == count
-    assert all("from 4.0 to 4.5 m along it (10 %" in line for line in found)
+    issues = list(ground_findings(ROUTE, arc_lengths(0, 10), street(15, gap), "s.xml"))
+    assert len(issues) == count
+    assert all("from 4.0 to 4.5 m along it (10 %" in line for line in issues)
 
 
 @pytest.mark.parametrize(("wall_at", "count"), [(9.8, 1), (10.2, 0)])
 def test_a_wall_behind_the_end_is_not_met(wall_at: float, count: int) -> None:
-    found = list(wall_findings(ROUTE, arc_lengths(0, 10), street(wall_at), "s.xml"))
-    assert len(found) == count
-    assert all("after 9.5 m along it, at (9.5, 0) m" in line for line in found)
+    issues = list(wall_findings(ROUTE, arc_lengths(0, 10), street(wall_at), "s.xml"))
+    assert len(issues) == count
+    assert all("after 9.5 m along it, at (9.5, 0) m" in line for line in issues)

@@ -93,11 +93,11 @@ def test_all_files_that_a_scene_names_are_listed(tmp_path):
         + SHAPE.format("$mesh", metal)
         + SHAPE.format("missing.ply", "").replace("<shape ", '<shape id="none" ')
     )
-    found = scene_files(write(tmp_path, body))
-    names = {path.relative_to(tmp_path.resolve()).as_posix() for path in found}
+    paths = scene_files(write(tmp_path, body))
+    names = {path.relative_to(tmp_path.resolve()).as_posix() for path in paths}
     xml = {"scene.xml", "parts/inner.xml"}
     assert names == {*xml, "quad.ply", "parts/quad.ply", "sky.exr", "eta.spd"}
-    assert len(found) == len(names)
+    assert len(paths) == len(names)
 
 
 FIELD = """<integrator type="field_integrator"><volume type="grid_field">

@@ -95,8 +95,8 @@ def test_rings_of_holes_in_far_walls_are_told(layers, is_whole):
     field = SolidField(0.2, 1 / 32)
     field.occupy(Occupancy(shell_cells((72, 72, 36), layers)))
     scores = evaluate(field, images, range(8), depth)
-    (found,) = (item for item in judge(scores) if "known surfaces" in item.name)
-    assert found.met == is_whole and (found.value > 0.01) != is_whole
+    (criterion,) = (item for item in judge(scores) if "known surfaces" in item.name)
+    assert criterion.met == is_whole and (criterion.value > 0.01) != is_whole
 
 
 def test_holes_are_counted_where_surfaces_are_known_and_in_the_box():
@@ -115,8 +115,8 @@ def test_holes_are_counted_where_surfaces_are_known_and_in_the_box():
 def test_images_with_alpha_lie_over_white():
     images, _ = sphere_views(1)
     alpha = images.images[0, ..., 3:] / 255
-    wanted = images.images[0, ..., :3] / 255 * alpha + (1 - alpha)
-    np.testing.assert_allclose(reference(images, 0), wanted, atol=1 / 255)
+    expected = images.images[0, ..., :3] / 255 * alpha + (1 - alpha)
+    np.testing.assert_allclose(reference(images, 0), expected, atol=1 / 255)
 
 
 def test_report_folder(tmp_path):

@@ -100,8 +100,8 @@ class Bench:
     def index(self, device: str, latency_s: float, period_s: float) -> int:
         """Return the number of the newest thing that a device has."""
         self.check(device)
-        seen_s = min(self.now, self.silent.get(device, np.inf)) - latency_s
-        return int((seen_s - self.start_s) / period_s)
+        newest_s = min(self.now, self.silent.get(device, np.inf)) - latency_s
+        return int((newest_s - self.start_s) / period_s)
 
     def check(self, name: str) -> None:
         if name in self.broken:
@@ -111,10 +111,10 @@ class Bench:
         log = DriveLog(path, CAMERA, self.clock, WALL_NS, {"policy": "stand-in"})
         camera, tracker = StandInCamera(self), StandInTracker(self)
         pilot, enable = StandInPilot(self), StandInEnable(self)
-        parts = Devices(camera, tracker, self.motor, pilot, enable)
+        car_devices = Devices(camera, tracker, self.motor, pilot, enable)
         settings, say = replace(SETTINGS, **changed), lambda text: None
         loop = DriveLoop(
-            parts, settings, log, self.with_sleep, self.clock, self.sleep, say
+            car_devices, settings, log, self.with_sleep, self.clock, self.sleep, say
         )
         stop = loop.run(lambda: self.check("signal"))
         log.close()
@@ -277,13 +277,13 @@ def datagrams(
     frame: int, items: Sequence[Item], size: int = 256, padding: bytes = b"\0"
 ) -> list[bytes]:
     """Return the blocks of a frame: as many as it takes, at least one."""
-    each, found = (size - 5) // 75, []
+    each, blocks = (size - 5) // 75, []
     for start in range(0, max(len(items), 1), each):
         held = items[start : start + each]
         raw = struct.pack("<I", frame) + struct.pack("<B", len(held))
         raw += b"".join(item_bytes(item) for item in held)
-        found.append(raw + (padding * size)[: size - len(raw)])
-    return found
+        blocks.append(raw + (padding * size)[: size - len(raw)])
+    return blocks
 
 
 class Sender:

@@ -246,9 +246,9 @@ class Vehicle(Actor):
 
     def get_physics_control(self) -> VehiclePhysicsControl:
         x, y = along(self._place.rotation.yaw)
-        here, wheels = self._place.location, []
+        centre, wheels = self._place.location, []
         for ahead, side in ((AXLE, -0.8), (AXLE, 0.8), (-AXLE, -0.8), (-AXLE, 0.8)):
-            place = here.x + ahead * x - side * y, here.y + ahead * y + side * x
+            place = centre.x + ahead * x - side * y, centre.y + ahead * y + side * x
             centimetres = Vector3D(100 * place[0], 100 * place[1], 35.0)
             wheels.append(WheelPhysicsControl(centimetres))
         return VehiclePhysicsControl(wheels)

@@ -39,25 +39,25 @@ class StandIn:
         text = self.path.read_text()
         return [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
 
-    def wait_for(self, **wanted: Any) -> list[dict[str, Any]]:
+    def wait_for(self, **fields: Any) -> list[dict[str, Any]]:
         """Return the log from the last command on, once its last line is as wanted."""
         deadline = time.monotonic() + 30
         while time.monotonic() < deadline:
             lines = self.log()
-            if lines and wanted.items() <= lines[-1].items():
+            if lines and fields.items() <= lines[-1].items():
                 starts = [
                     i for i, line in enumerate(lines) if "command" in line["event"]
                 ]
                 return lines[starts[-1] if starts else 0 :]
             time.sleep(0.02)
-        raise TimeoutError(f"{self.path}: never {wanted}")
+        raise TimeoutError(f"{self.path}: never {fields}")
 
-    def wait_for_line(self, **wanted: Any) -> None:
+    def wait_for_line(self, **fields: Any) -> None:
         """Return once the log has a line as wanted."""
         deadline = time.monotonic() + 30
-        while not any(wanted.items() <= line.items() for line in self.log()):
+        while not any(fields.items() <= line.items() for line in self.log()):
             if time.monotonic() > deadline:
-                raise TimeoutError(f"{self.path}: never {wanted}")
+                raise TimeoutError(f"{self.path}: never {fields}")
             time.sleep(0.02)
 
     def close(self) -> None:

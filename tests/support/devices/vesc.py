@@ -65,7 +65,7 @@ def frame(payload: bytes) -> bytes:
 
 def take_frames(heard: bytearray) -> list[bytes]:
     """Take the whole frames off the front of what was heard."""
-    found = []
+    payloads = []
     while heard:
         head = {2: 2, 3: 3}.get(heard[0])
         if head is not None and len(heard) < head:
@@ -79,11 +79,11 @@ def take_frames(heard: bytearray) -> list[bytes]:
         payload = bytes(heard[head : head + size])
         tail = checksum(payload).to_bytes(2, "big") + b"\x03"
         if heard[head + size : head + size + 3] == tail:
-            found.append(payload)
+            payloads.append(payload)
             del heard[: head + size + 3]
         else:
             del heard[0]
-    return found
+    return payloads
 
 
 class Car:
@@ -97,8 +97,8 @@ class Car:
     def tick(self) -> None:
         """Move for a tick under what the motor does."""
         if self.mode == "rpm" and abs(self.value) >= LEAST_ERPM:
-            wanted = (self.value / ERPM_PER_MS - self.speed) / 0.05
-            self.speed += max(-MOST_MS2, min(MOST_MS2, wanted)) * TICK_S
+            acceleration = (self.value / ERPM_PER_MS - self.speed) / 0.05
+            self.speed += max(-MOST_MS2, min(MOST_MS2, acceleration)) * TICK_S
         else:
             rolling = self.friction_ms2
             if self.mode == "brake":
@@ -137,10 +137,10 @@ class Controller:
         self.ticks, self.servo, self.fault = 0, 0.5, 0
         self.timed_out = self.mute = self.killed = self.has_fired = False
         signature = SIGNATURES.get(self.firmware, 763356168)
-        rest = random.Random(5).randbytes(options.config_bytes - 14)
+        tail = random.Random(5).randbytes(options.config_bytes - 14)
         after_ms, brake_a = options.timeout_ms, options.brake_a
         timeout = struct.pack(">IBIf", signature, 9, after_ms, brake_a)
-        self.config = self.stored = timeout + rest
+        self.config = self.stored = timeout + tail
         self.is_fed, self.counted_m = False, None
         self.busy_until = 0.0
 
@@ -186,29 +186,29 @@ class Controller:
         return None if self.mute else reply
 
     def _obey(self, payload: bytes) -> bytes | None:
-        number, rest = payload[0], payload[1:]
+        number, body = payload[0], payload[1:]
         if number in ALIVE_IDS:
             self.alive, self.timed_out = self.time, False
-            self._drive(number, rest)
+            self._drive(number, body)
             self.tell(f"command {number}")
-        elif number == 12 and len(rest) == 2:
-            self.servo = min(1.0, max(0.0, struct.unpack(">h", rest)[0] / 1000))
+        elif number == 12 and len(body) == 2:
+            self.servo = min(1.0, max(0.0, struct.unpack(">h", body)[0] / 1000))
         elif number == 0:
             return self._version()
         elif number == 4:
             return b"\x04" + self._values(0xFFFFFFFF)
-        elif number == 50 and len(rest) == 4:
-            return b"\x32" + rest + self._values(int.from_bytes(rest, "big"))
+        elif number == 50 and len(body) == 4:
+            return b"\x32" + body + self._values(int.from_bytes(body, "big"))
         elif number == 17:
             return b"\x11" + self.config
         elif number == 16 or (number == 149 and self.firmware >= (6, 0)):
-            return self._configure(number, rest)
+            return self._configure(number, body)
         return None
 
-    def _drive(self, number: int, rest: bytes) -> None:
-        if number == 30 or len(rest) != 4:
+    def _drive(self, number: int, body: bytes) -> None:
+        if number == 30 or len(body) != 4:
             return
-        value = struct.unpack(">i", rest)[0]
+        value = struct.unpack(">i", body)[0]
         if self.killed:
             return
         modes = {6: ("current", 1e3), 7: ("brake", 1e3), 8: ("rpm", 1.0)}
@@ -219,13 +219,13 @@ class Controller:
         name = b"410\x00"
         return bytes([0, *self.firmware]) + name + bytes(range(12)) + b"\x01\x00\x00"
 
-    def _configure(self, number: int, rest: bytes) -> bytes | None:
-        if self.flaw == "deaf" or rest[:4] != self.config[:4]:
+    def _configure(self, number: int, body: bytes) -> bytes | None:
+        if self.flaw == "deaf" or body[:4] != self.config[:4]:
             return None
         if self.flaw != "locked":
-            self.config = rest
+            self.config = body
         if self.flaw == "scribbling":
-            self.config = self.config[:40] + bytes([rest[40] ^ 1]) + self.config[41:]
+            self.config = self.config[:40] + bytes([body[40] ^ 1]) + self.config[41:]
         if number == 16:
             self.busy_until = self.time + 0.2
         self.tell("flash" if number == 16 else "memory")

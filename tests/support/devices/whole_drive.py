@@ -60,7 +60,7 @@ def drive(
     images = (np.full((16, 32, 3), i % 256, np.uint8) for i in range(6000))
     write_video(folder / "seen.mp4", images, 30)
     files.write_text(folder / "camera.toml", CAMERA)
-    port, told = free_port(), []
+    port, lines = free_port(), []
     with (
         closing(Pad(folder / "js0")) as pad,
         StandIn(folder / "car.jsonl") as vesc,
@@ -85,7 +85,7 @@ def drive(
         ending = threading.Timer(120.0, process.kill)
         ending.start()
         for line in process.stdout:
-            told.append(line.strip())
+            lines.append(line.strip())
             if "hold it as long" in line or "hold the enable button to drive" in line:
                 pad.press(True)
             elif "release the enable button" in line or line.startswith("not ready"):
@@ -96,6 +96,6 @@ def drive(
         ending.cancel()
         process.stdout.close()
         vesc.wait_for(speed_ms=0.0)
-    said = "\n".join(told)
+    said = "\n".join(lines)
     print(said)
     return code, said

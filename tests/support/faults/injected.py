@@ -62,8 +62,8 @@ class Watch:
         new: dict[int, str] = {}
         opened, written, show = os.open, os.write, StageBars.show
 
-        def open_(path, *rest, **more) -> int:
-            descriptor = opened(path, *rest, **more)
+        def open_(path, *arguments, **options) -> int:
+            descriptor = opened(path, *arguments, **options)
             new.pop(descriptor, None)
             name = Path(os.fsdecode(path)).name
             if files.TEMPORARY.fullmatch(name):
@@ -82,8 +82,8 @@ class Watch:
             self.meet()
             return done
 
-        def draw(bars, stage, *state, **more) -> None:
-            show(bars, stage, *state, **more)
+        def draw(bars, stage, *state, **options) -> None:
+            show(bars, stage, *state, **options)
             self.stages[stage] = self.stages.get(stage, 0) + 1
             if stage == self.place and self.stages[stage] == self.at and not self.met:
                 self.meet()
@@ -158,9 +158,9 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
-def wait_for(found: Callable[[], object]) -> None:
+def wait_for(condition: Callable[[], object]) -> None:
     """Wait until something holds; fails after a time that nothing here takes."""
     end = time.monotonic() + 60
-    while not found():
+    while not condition():
         assert time.monotonic() < end
         time.sleep(0.002)

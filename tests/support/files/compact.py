@@ -29,9 +29,11 @@ def flipped(harmonics: np.ndarray) -> np.ndarray:
         values = dr.sh_eval(mi.Vector3f(of.T.astype(np.float32)), degree)
         return np.stack([np.broadcast_to(x.numpy(), 64) for x in values], 1)
 
-    seen = np.einsum("dk,nkc->dnc", basis(directions), harmonics)
-    found = np.linalg.lstsq(basis(directions * FLIP), seen.reshape(64, -1), rcond=None)
-    return found[0].reshape(harmonics.shape[1], -1, 3).swapaxes(0, 1)
+    colours = np.einsum("dk,nkc->dnc", basis(directions), harmonics)
+    solution = np.linalg.lstsq(
+        basis(directions * FLIP), colours.reshape(64, -1), rcond=None
+    )
+    return solution[0].reshape(harmonics.shape[1], -1, 3).swapaxes(0, 1)
 
 
 def spz(item: Splats, version: int = 3, **header: int) -> bytes:

@@ -141,17 +141,17 @@ def splats(
     opacities=0.6,
     scales=0.1,
     quaternions=(1.0, 0.0, 0.0, 0.0),
-    rest=None,
+    bands=None,
 ) -> Splats:
     """Make splats; everything but the centres (n, 3) is broadcast to (n, ...).
 
-    Colours are sRGB, quaternions w, x, y, z, and rest (n, k - 1, 3) more harmonics.
+    Colours are sRGB, quaternions w, x, y, z, and bands (n, k - 1, 3) more harmonics.
     """
     centers = np.atleast_2d(np.asarray(centers, np.float32))
     n = len(centers)
     harmonics = (np.broadcast_to(colours, (n, 3))[:, None] - 0.5) / C0
-    if rest is not None:
-        harmonics = np.concatenate([harmonics, rest], 1)
+    if bands is not None:
+        harmonics = np.concatenate([harmonics, bands], 1)
     turns = np.broadcast_to(np.asarray(quaternions, np.float32), (n, 4))
     turns = turns / np.linalg.norm(turns, axis=1, keepdims=True)
     scales = np.asarray(scales, np.float32)
@@ -192,10 +192,10 @@ def wall(
 def columns(item: Splats) -> dict[str, np.ndarray]:
     """Return what a trainer writes, by property, in its order."""
     n, k = item.harmonics.shape[:2]
-    rest = item.harmonics[:, 1:].transpose(0, 2, 1).reshape(n, -1)
+    bands = item.harmonics[:, 1:].transpose(0, 2, 1).reshape(n, -1)
     names = [*NAMES, *(f"f_rest_{i}" for i in range(3 * (k - 1))), *TAIL]
     logits = np.log(item.opacities) - np.log1p(-item.opacities)
-    places = item.centers, np.zeros((n, 3)), item.harmonics[:, 0], rest
+    places = item.centers, np.zeros((n, 3)), item.harmonics[:, 0], bands
     shapes = logits[:, None], np.log(item.scales), item.quaternions
     return dict(zip(names, np.hstack([*places, *shapes]).T, strict=True))
 
@@ -235,7 +235,7 @@ def reference(
     rows = axes.transpose(0, 2, 1) / item.scales[:, :, None].astype(float)
     colour = np.maximum(C0 * item.harmonics[:, 0].astype(float) + 0.5, 0)
     o = np.einsum("nij,nj->ni", rows, origin - item.centers.astype(float))
-    seen, opacity, moment = [], [], []
+    colours, opacity, moment = [], [], []
     for direction in directions.astype(float):
         d = rows @ direction
         t = -(o * d).sum(1) / (d**2).sum(1)
@@ -245,7 +245,7 @@ def reference(
         order = np.argsort(t)
         passed = np.cumprod(np.concatenate([[1.0], 1 - alpha[order]]))
         weight = passed[:-1] * alpha[order]
-        seen.append(weight @ colour[order])
+        colours.append(weight @ colour[order])
         opacity.append(1 - passed[-1])
         moment.append(weight @ t[order])
-    return np.array(seen), np.array(opacity), np.array(moment)
+    return np.array(colours), np.array(opacity), np.array(moment)

@@ -88,8 +88,8 @@ def make_transfer(folder, complete=True):
     def column(environment, condition, mean, out):
         cases = {"no_object": case(0.05, 0), "attack": case(mean, out)}
         transfer = {"of": 2, "kept": out, "rate_ci95": [0.25, 0.75]}
-        about = {"environment": environment, "condition": condition, "attacks": 2}
-        return about | {"cases": cases, "ratio_to_surrogate": 0.5, "transfer": transfer}
+        entry = {"environment": environment, "condition": condition, "attacks": 2}
+        return entry | {"cases": cases, "ratio_to_surrogate": 0.5, "transfer": transfer}
 
     rows = [
         {"attack": name, "environment": environment, "condition": "day"}
@@ -120,8 +120,8 @@ def make_retraining(path):
     row |= {"before": before, "after": after, "clean_ratio": 1.2}
     row["attack_to_clean"] = {"before": 16.0, "after": 1.5}
     left_out = {"third": "the expert leaves its lane"}
-    about = {"policy": {}, "runs": [{}, {}], "held_out": [], "left_out": left_out}
-    files.write_json(path, {"schema": 1, **about, "table": [row]})
+    header = {"policy": {}, "runs": [{}, {}], "held_out": [], "left_out": left_out}
+    files.write_json(path, {"schema": 1, **header, "table": [row]})
 
 
 #: What `metrics.json` of a run folder holds.

@@ -16,5 +16,5 @@ def fenced(page: Path, *languages: str) -> list[str]:
         page: its fences may be indented in a list.
         languages: words after the opening fence, "" for none.
     """
-    found = _FENCE.findall(page.read_text("utf-8"))
-    return [dedent(block) for _, language, block in found if language in languages]
+    matches = _FENCE.findall(page.read_text("utf-8"))
+    return [dedent(block) for _, language, block in matches if language in languages]

@@ -24,7 +24,7 @@ class Page:
     """One tab, and all that its console said that is no information."""
 
     def __init__(self, socket):
-        self._socket, self._count, self.told = socket, 0, []
+        self._socket, self._count, self.messages = socket, 0, []
         self.requests = []
         for domain in ("Runtime", "Log", "Page", "Network"):
             self.call(f"{domain}.enable")
@@ -43,33 +43,35 @@ class Page:
     def _note(self, message):
         method, params = message.get("method"), message.get("params", {})
         if method == "Runtime.exceptionThrown":
-            self.told.append(str(params["exceptionDetails"]))
+            self.messages.append(str(params["exceptionDetails"]))
         elif method == "Runtime.consoleAPICalled":
             if params["type"] in ("error", "warning", "assert"):
-                self.told.append(" ".join(str(x.get("value")) for x in params["args"]))
+                self.messages.append(
+                    " ".join(str(x.get("value")) for x in params["args"])
+                )
         elif method == "Log.entryAdded":
             if params["entry"]["level"] in ("error", "warning"):
-                self.told.append(params["entry"]["text"])
+                self.messages.append(params["entry"]["text"])
         elif method == "Network.requestWillBeSent":
             self.requests.append(params["request"]["url"])
-        self.told = [x for x in self.told if not any(h in x for h in HARMLESS)]
+        self.messages = [x for x in self.messages if not any(h in x for h in HARMLESS)]
 
     def ask(self, script):
-        found = self.call(
+        reply = self.call(
             "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
         )
-        assert "exceptionDetails" not in found, found
-        return found["result"].get("value")
+        assert "exceptionDetails" not in reply, reply
+        return reply["result"].get("value")
 
     def wait(self, script):
         """Wait until JavaScript gives something true, and return it."""
         return self.until(lambda: self.ask(script), script)
 
-    def until(self, found, about):
+    def until(self, condition, event):
         """Wait until something holds; drawing without a GPU takes its time."""
         end = time.monotonic() + 240
-        while not (value := found()):
-            assert time.monotonic() < end, f"{about} came to nothing: {self.told}"
+        while not (value := condition()):
+            assert time.monotonic() < end, f"{event} came to nothing: {self.messages}"
             time.sleep(0.2)
         return value
 
@@ -78,8 +80,8 @@ class Page:
 
     def resize(self, width, height):
         """Give the page so many pixels, whatever the window has."""
-        about = {"width": width, "height": height, "deviceScaleFactor": 1}
-        self.call("Emulation.setDeviceMetricsOverride", mobile=False, **about)
+        metrics = {"width": width, "height": height, "deviceScaleFactor": 1}
+        self.call("Emulation.setDeviceMetricsOverride", mobile=False, **metrics)
 
     def shot(self, path):
         data = self.call("Page.captureScreenshot", format="png")["data"]

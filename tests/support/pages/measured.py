@@ -16,6 +16,6 @@ def page(name: str) -> str:
 
 def results(name: str) -> dict[str, Any]:
     """Return the newest file of a measurement on a machine without a GPU."""
-    found = sorted((ROOT / "bench/results").glob(f"*-cores-{name}.json"))
-    assert found, f"bench/results: no file of {name}"
-    return json.loads(found[-1].read_text("utf-8"))
+    paths = sorted((ROOT / "bench/results").glob(f"*-cores-{name}.json"))
+    assert paths, f"bench/results: no file of {name}"
+    return json.loads(paths[-1].read_text("utf-8"))

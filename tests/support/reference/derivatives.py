@@ -64,9 +64,9 @@ class Derivatives:
     def gradient(self) -> np.ndarray:
         dr.enable_grad(self._set(self.base))
         self.params.update()
-        found = self.output()
-        weight = type(found)(self.weight.reshape(found.numpy().shape))
-        dr.backward(dr.sum(found * weight, axis=None))
+        output = self.output()
+        weight = type(output)(self.weight.reshape(output.numpy().shape))
+        dr.backward(dr.sum(output * weight, axis=None))
         result = dr.grad(self.params[self.key]).numpy().astype(float) * self.unit
         self._reset()
         return result.ravel()
@@ -79,9 +79,9 @@ class Derivatives:
         shaped = shaped.astype(self.base.dtype)
         dr.set_grad(self.params[self.key], type(attached)(shaped))
         dr.forward_from(self.params[self.key], dr.ADFlag.ClearEdges)
-        found = self.output()
-        dr.forward_to(found)
-        result = total(dr.grad(found), self.weight)
+        output = self.output()
+        dr.forward_to(output)
+        result = total(dr.grad(output), self.weight)
         self._reset()
         return result
 

@@ -80,15 +80,15 @@ def quadrature(
     Gauss-Legendre on the parts between the borders of the boxes, with the closed form
     of the transmittance. Poses must not scale or turn (a blob is round).
     """
-    parts = [(f, o - p.translation, *box_interval(o, d, p, f.half)) for f, p in fields]
-    cuts = np.sort(np.stack([cut for part in parts for cut in part[2:]], 1), axis=1)
+    spans = [(f, o - p.translation, *box_interval(o, d, p, f.half)) for f, p in fields]
+    cuts = np.sort(np.stack([cut for span in spans for cut in span[2:]], 1), axis=1)
     nodes, weights = np.polynomial.legendre.leggauss(200)
     radiance, moment = np.zeros((len(o), 3)), np.zeros(len(o))
     for a, b in zip(cuts.T[:-1], cuts.T[1:], strict=True):
         t = 0.5 * (a + b)[:, None] + 0.5 * (b - a)[:, None] * nodes
         tau = np.zeros_like(t)
         density, emission = np.zeros_like(t), np.zeros((*t.shape, 3))
-        for field, local, near, far in parts:
+        for field, local, near, far in spans:
             clipped = np.clip(t, near[:, None], far[:, None])
             tau += field.depth_to(local, d, near, clipped)
             x = local[:, None] + t[..., None] * d[:, None]
@@ -97,10 +97,10 @@ def quadrature(
             density += sigma
             colour = 0.5 + 0.4 * np.sin(x @ WAVES.T + PHASES)
             emission += sigma[..., None] * colour
-        given = np.exp(-tau) * weights * 0.5 * (b - a)[:, None]
-        radiance += (given[..., None] * emission).sum(1)
-        moment += (given * density * t).sum(1)
-    ends = [f.depth_to(q, d, near, far[:, None])[:, 0] for f, q, near, far in parts]
+        transmitted = np.exp(-tau) * weights * 0.5 * (b - a)[:, None]
+        radiance += (transmitted[..., None] * emission).sum(1)
+        moment += (transmitted * density * t).sum(1)
+    ends = [f.depth_to(q, d, near, far[:, None])[:, 0] for f, q, near, far in spans]
     return radiance, -np.expm1(-np.sum(ends, axis=0)), moment
 
 
@@ -174,9 +174,9 @@ class FileReader:
         if self.is_grid:
             held = np.concatenate([self._held(*level) for level in self._sizes()])
             for name in ("density", "texture"):
-                kept = self.tensors[name]
-                self.tensors[name] = np.full((len(held), *kept.shape[1:]), np.nan)
-                self.tensors[name][held] = kept
+                stored = self.tensors[name]
+                self.tensors[name] = np.full((len(held), *stored.shape[1:]), np.nan)
+                self.tensors[name][held] = stored
 
     def density(self, points: np.ndarray) -> np.ndarray:
         unit = (points - self.lower) / (self.upper - self.lower)

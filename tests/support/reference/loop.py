@@ -110,7 +110,7 @@ class AnalyticSensor(AbstractDifferentiableSensor):
         named = {f"texture{i}": value for i, value in enumerate(self._gradients)}
         return {key: (named | {"offsets": self._by_offsets})[key] for key in self.keys}
 
-    def start_gradient(self, more: Any = ()) -> None:
+    def start_gradient(self, extra_keys: Any = ()) -> None:
         self._gradients = [dr.zeros(tensor_type(), t.shape) for t in self._textures]
         self._by_offsets = dr.zeros(tensor_type(), self.offsets.shape)
 
@@ -196,8 +196,8 @@ class TorchLoop:
         goals = torch.full((len(initial),), self.goal)
         self.images = []
         for period in range(horizon):
-            seen = state if attached else state.detach()
-            image = torch_image(seen, period, textures, offsets)
+            camera_state = state if attached else state.detach()
+            image = torch_image(camera_state, period, textures, offsets)
             self.images.append(image)
             controls.append(self.module(image.permute(0, 3, 1, 2), goals))
             for _ in range(self.substeps):

@@ -49,7 +49,7 @@ def make_dense(folder):
     save_field(folder / "object.safetensors", item)
 
 
-def job(folder, output, change=("", ""), on_progress=None, notices=None, **more):
+def job(folder, output, change=("", ""), on_progress=None, notices=None, **options):
     from mi_nerfattack.experiment.job import Job
     from mi_nerfattack.policy.torch_policy import TorchPolicy
     from mi_nerfattack.scenario.scenario import load_scenario
@@ -63,7 +63,7 @@ def job(folder, output, change=("", ""), on_progress=None, notices=None, **more)
     path.write_text(text)
     scenario, text = load_scenario(path)
     policy = TorchPolicy(toy.SmoothPolicy())
-    result = Job(scenario, text, policy, output, **more)
+    result = Job(scenario, text, policy, output, **options)
     result.on_progress = on_progress or result.on_progress
     result.on_notice = (notices if notices is not None else []).append
     return result
@@ -82,9 +82,9 @@ def stop_at(stage, step, stop=None):
     return on_progress
 
 
-def interrupt(folder, output, stage, step, **more):
+def interrupt(folder, output, stage, step, **options):
     with pytest.raises(KeyboardInterrupt):
-        job(folder, output, on_progress=stop_at(stage, step), **more).run()
+        job(folder, output, on_progress=stop_at(stage, step), **options).run()
 
 
 def checkpoint_of(output):
@@ -96,11 +96,11 @@ def contents(output):
     return {path: path.read_bytes() for path in output.rglob("*") if path.is_file()}
 
 
-def assert_same_state(output, whole):
-    expected, found = checkpoint_of(whole), checkpoint_of(output)
-    assert set(expected) == set(found)
+def assert_same_state(output, uninterrupted):
+    expected, actual = checkpoint_of(uninterrupted), checkpoint_of(output)
+    assert set(expected) == set(actual)
     for name, value in expected.items():
-        assert np.array_equal(value, found[name], equal_nan=True), name
+        assert np.array_equal(value, actual[name], equal_nan=True), name
 
 
 def assert_same_drives(drives, expected):

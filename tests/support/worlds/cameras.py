@@ -45,22 +45,24 @@ def block(centre: list[float], half: list[float]) -> dict[str, Any]:
     return {"type": "cube", "to_world": place}
 
 
-def film(**more: Any) -> dict[str, Any]:
+def film(**properties: Any) -> dict[str, Any]:
     pixels = "luminance" if mi.is_monochromatic else "rgb"
     base = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT}
-    return {**base, "pixel_format": pixels, "component_format": "float32", **more}
+    return {**base, "pixel_format": pixels, "component_format": "float32", **properties}
 
 
-def sensor(description: dict[str, Any], **film_more: Any) -> dict[str, Any]:
+def sensor(description: dict[str, Any], **film_properties: Any) -> dict[str, Any]:
     to_world = mi.ScalarTransform4f().look_at(EYE, [0, 0, 0], [0, 1, 0])
-    return {**description, "to_world": to_world, "film": film(**film_more)}
+    return {**description, "to_world": to_world, "film": film(**film_properties)}
 
 
 def load(description: dict[str, Any]) -> Any:
     return mi.load_dict(description, parallel=False)
 
 
-def world(camera: dict[str, Any], integrator: dict[str, Any], **more: Any) -> mi.Scene:
+def world(
+    camera: dict[str, Any], integrator: dict[str, Any], **objects: Any
+) -> mi.Scene:
     """Load a chequered ball under a sky, with the camera as `eye`."""
     chequers = {
         "type": "checkerboard",
@@ -69,7 +71,7 @@ def world(camera: dict[str, Any], integrator: dict[str, Any], **more: Any) -> mi
     }
     ball = {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": chequers}}
     scene = {"type": "scene", "integrator": integrator, "eye": camera, "ball": ball}
-    return mi.load_dict(scene | {"sky": {"type": "constant"}} | more, parallel=False)
+    return mi.load_dict(scene | {"sky": {"type": "constant"}} | objects, parallel=False)
 
 
 def rays(camera: mi.Sensor, pixel: np.ndarray) -> tuple[mi.RayDifferential3f, Any]:

@@ -108,8 +108,8 @@ def small_bricks(rng: np.random.Generator) -> BrickField:
     divided = rng.choice(np.array([1, 2, 4, 8], np.uint8), cells.sum())
     words = rng.integers(0, 1 << 32, vertex_count(divided), np.uint32)
     sky = rng.normal(size=(4, 8, 3)).astype(np.float32)
-    parts = Occupancy(cells, octants), divided, words, Codes(-2.0, 3.0), sky
-    return BrickField(-ONES, ONES, *parts, step_m=0.08, cone=1 / 64)
+    contents = Occupancy(cells, octants), divided, words, Codes(-2.0, 3.0), sky
+    return BrickField(-ONES, ONES, *contents, step_m=0.08, cone=1 / 64)
 
 
 def sigmoid_to_linear(raw: np.ndarray) -> np.ndarray:
@@ -248,7 +248,7 @@ def write_blob(folder: Path, rng: np.random.Generator) -> dict[str, Any]:
 
 def load(
     nested: dict[str, Any],
-    more: dict[str, Any] | None = None,
+    objects: dict[str, Any] | None = None,
     *,
     eye: Any = (-3.0, 0.2, 0.6),
     target: Any = (0.0, 0.0, 0.0),
@@ -259,7 +259,7 @@ def load(
 
     Args:
         nested: of the integrator, or another integrator.
-        more: objects of the scene, or others in their place.
+        objects: objects of the scene, or others in their place.
         eye: place of the camera, metres.
         target: place that the camera looks at, metres.
         fov: horizontal field of view, degrees.
@@ -280,5 +280,5 @@ def load(
     integrator = {"type": "field_integrator", "id": "fields", "stop": 0.0, **nested}
     if nested.get("type", "field_integrator") != "field_integrator":
         integrator = nested
-    scene = {"type": "scene", "i": integrator, "camera": sensor, **(more or {})}
+    scene = {"type": "scene", "i": integrator, "camera": sensor, **(objects or {})}
     return mi.load_dict(scene, parallel=False)

@@ -64,11 +64,11 @@ def write_lens(folder: Path) -> Path:
 
 
 def write_slab(
-    folder: Path, film: str = BOX, fov: float = 5, inside: str = "", more: str = ""
+    folder: Path, film: str = BOX, fov: float = 5, inside: str = "", objects: str = ""
 ) -> Path:
     """Write a homogeneous box [-1, 1]^3 in front of the camera.
 
-    The film nests `film`, the integrator `inside` too, and the scene `more`.
+    The film nests `film`, the integrator `inside` too, and the scene `objects`.
     """
     save_field(folder / "box.safetensors", small.homogeneous(DENSITY, RAW_COLOUR))
     integrator = (
@@ -76,7 +76,7 @@ def write_slab(
         '<volume type="grid_field" id="box"><string name="filename" '
         f'value="box.safetensors"/></volume>{inside}</integrator>'
     )
-    return write_scene(folder, integrator + sensor(film, fov=fov) + more)
+    return write_scene(folder, integrator + sensor(film, fov=fov) + objects)
 
 
 def opengl_pose(eye: np.ndarray) -> np.ndarray:

@@ -180,8 +180,8 @@ def flat(gradient):
     return [*textures, np.array(gradient.initial).T, by_offsets]
 
 
-def assert_close(found, expected, tolerance=1e-8):
-    for a, b in zip(found, expected, strict=True):
+def assert_close(actual, expected, tolerance=1e-8):
+    for a, b in zip(actual, expected, strict=True):
         scale = np.linalg.norm(b)
         assert np.linalg.norm(a - b) <= tolerance * scale, (a, b)
 

@@ -182,7 +182,7 @@ class PaintedEnvironment(AbstractEnvironment):
         self.camera, self.conditions = camera, conditions
         self.rig = Rig.of_one(camera, CameraMount())
         self.states: list[np.ndarray] = []
-        self.seen: list[list[PosedField]] = []
+        self.shown: list[list[PosedField]] = []
         self.seeds: list[int] = []
         self.starts: list[int] = []
         self.objects: list[PosedField] = []
@@ -214,7 +214,7 @@ class PaintedEnvironment(AbstractEnvironment):
 
     def _observe(self):
         self.states.append(self._state)
-        self.seen.append(list(self.objects))
+        self.shown.append(list(self.objects))
         shape = self.camera.height, self.camera.width
         image = np.broadcast_to(painted(self._state, self.conditions), (*shape, 3))
         return CameraFrame(image.copy(), np.full(shape, np.inf, "f4"), np.eye(4))

@@ -62,17 +62,17 @@ def sphere_views(count: int = 16, alpha: bool = True) -> tuple[PosedImages, np.n
 
 def mixed_views(count: int, alpha: bool = True) -> tuple[PosedImages, np.ndarray]:
     """Cut the views of the sphere to several sizes, so that their intrinsics differ."""
-    whole, depth = sphere_views(count, alpha)
+    views, depth = sphere_views(count, alpha)
     crops = [np.s_[:, :], np.s_[:, 4:-4], np.s_[3:, :], np.s_[:, 4:-4]] * count
-    cut = [a[crop] for a, crop in zip(whole.images, crops, strict=False)]
+    cut = [a[crop] for a, crop in zip(views.images, crops, strict=False)]
     maps = [a[crop] for a, crop in zip(depth, crops, strict=False)]
     cameras = []
     for own, (rows, columns) in zip(cut, crops, strict=False):
-        cx = whole.camera.cx - (columns.start or 0)
-        cy = whole.camera.cy - (rows.start or 0)
+        cx = views.camera.cx - (columns.start or 0)
+        cy = views.camera.cy - (rows.start or 0)
         size = {"height": own.shape[0], "width": own.shape[1]}
-        cameras.append(replace(whole.camera, cx=cx, cy=cy, **size))
-    mixed = replace(whole, images=stacked(cut), cameras=tuple(cameras))
+        cameras.append(replace(views.camera, cx=cx, cy=cy, **size))
+    mixed = replace(views, images=stacked(cut), cameras=tuple(cameras))
     return mixed, stacked(maps)
 
 
@@ -170,14 +170,14 @@ def corner_poses(count: int = 8) -> np.ndarray:
     return np.stack([look_at(eye, np.array([2.2, 2.2, 1.2])) for eye in eyes])
 
 
-def aligned(found: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def aligned(points: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fit a similarity of points (n, 3); return it applied, and its rotation."""
-    centre, target = found.mean(0), given.mean(0)
-    u, s, vt = np.linalg.svd((given - target).T @ (found - centre))
+    centre, target = points.mean(0), targets.mean(0)
+    u, s, vt = np.linalg.svd((targets - target).T @ (points - centre))
     sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
     turn = u @ sign @ vt
-    scale = np.trace(np.diag(s) @ sign) / ((found - centre) ** 2).sum()
-    return scale * (found - centre) @ turn.T + target, turn
+    scale = np.trace(np.diag(s) @ sign) / ((points - centre) ** 2).sum()
+    return scale * (points - centre) @ turn.T + target, turn
 
 
 HALF, HEIGHT = 25.0, 12.0  # metres
@@ -227,8 +227,8 @@ def shell_cells(shape: tuple[int, int, int], layers: int) -> np.ndarray:
     scale = np.array(shape) / (ROOM[1] - ROOM[0])
     faces = np.array([[-HALF, -HALF, 0.0], [HALF, HALF, HEIGHT]])
     low, high = np.floor((faces - ROOM[0]) * scale).astype(int)
-    more = layers - 1
-    x, y, z = (slice(a - more, b + more + 1) for a, b in zip(low, high, strict=True))
+    outer = layers - 1
+    x, y, z = (slice(a - outer, b + outer + 1) for a, b in zip(low, high, strict=True))
     cells[x, y, z.start : high[2] + 1] = True
     cells[low[0] + 1 : high[0], low[1] + 1 : high[1], low[2] + 1 :] = False
     return cells

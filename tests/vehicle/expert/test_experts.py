@@ -83,8 +83,8 @@ def test_expert_keeps_the_lane_and_recovers(name, kind):
         assert most < LIMIT_M and late < LIMIT_M
 
 
-def made(unit="rad/s", period=0.1, **more):
-    return lambda: expert_for(unit, STRAIGHT, period, **more)
+def made(unit="rad/s", period=0.1, **options):
+    return lambda: expert_for(unit, STRAIGHT, period, **options)
 
 
 test_unusable_numbers = refusals(
@@ -136,13 +136,13 @@ def test_future_positions_are_those_of_small_steps(unit):
     lateral, heading = np.array([0.0, 1.2, -0.8]), np.array([0.0, 0.3, -0.2])
     poses = route.pose_at(np.array([3.0, 40.0, 75.0]), lateral, heading)
     times = (0.07, 0.5, 1.0, 1.25)
-    found = future_positions(
+    predicted = future_positions(
         expert, poses, times, speed=speed, period=period, wheelbase=wheelbase
     )
-    assert found.shape == (3, 4, 2)
+    assert predicted.shape == (3, 4, 2)
 
     ratio = speed / wheelbase
-    for pose, positions in zip(poses, found, strict=True):
+    for pose, positions in zip(poses, predicted, strict=True):
         x, y, theta = pose
         path, small, rate = [], 1e-4, 0.0
         for step in range(12_501):

@@ -35,22 +35,22 @@ def reference(points, closed, x, y, theta, within=1e-6):
     n = len(points)
     count = n if closed else n - 1
     lengths = [math.dist(points[i], points[(i + 1) % n]) for i in range(count)]
-    found = []
+    feet = []
     for i in range(count):
         (ax, ay), (bx, by) = points[i], points[(i + 1) % n]
         tx, ty = (bx - ax) / lengths[i], (by - ay) / lengths[i]
         along = (x - ax) * tx + (y - ay) * ty
         foot = min(max(along, 0.0), lengths[i])
         miss = math.hypot(x - ax - foot * tx, y - ay - foot * ty)
-        found.append((miss, sum(lengths[:i]) + foot, i, along, (tx, ty)))
-    found.sort(key=lambda entry: entry[0])
-    least, first_arc = found[0][:2]
-    found = [entry for entry in found if entry[0] < least + within]
-    apart = [abs(entry[1] - first_arc) for entry in found]
+        feet.append((miss, sum(lengths[:i]) + foot, i, along, (tx, ty)))
+    feet.sort(key=lambda entry: entry[0])
+    least, first_arc = feet[0][:2]
+    feet = [entry for entry in feet if entry[0] < least + within]
+    apart = [abs(entry[1] - first_arc) for entry in feet]
     if closed:
         apart = [min(gap, sum(lengths) - gap) for gap in apart]
     measured = []
-    for miss, arc, i, along, (tx, ty) in found:
+    for miss, arc, i, along, (tx, ty) in feet:
         border = min(abs(along), abs(along - lengths[i]))
         ax, ay = points[i]
         direction = math.atan2(ty, tx)
@@ -154,9 +154,9 @@ def test_heading_and_curvature_of_a_circle(turns):
     np.testing.assert_allclose(route.curvature_at(s, 0.3), turns / 2, rtol=1e-3)
     square = Route("square", 0, SQUARE, closed=True)  # the arc length wraps
     s = np.array([0.25, 1.0, 15.5, 16.5, -0.5, 33.0])
-    found = square.project_numpy(square.pose_at(s, 0.1, 0.2))
+    projection = square.project_numpy(square.pose_at(s, 0.1, 0.2))
     expected = [[0.25, 1, 15.5, 0.5, 15.5, 1], [0.1] * 6, [0.2] * 6]
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(projection, expected, atol=1e-12)
 
 
 ROUTES = [
@@ -193,7 +193,7 @@ def gradient_drjit(route, name, states):
 def test_derivative_by_central_differences(route, name):
     states = regular_states(route)
     assert len(states) > 20
-    found = gradient_drjit(route, name, states)
+    gradient = gradient_drjit(route, name, states)
     direction = np.random.default_rng(5).normal(size=states.shape)
     step = 1e-6
 
@@ -201,7 +201,7 @@ def test_derivative_by_central_differences(route, name):
         return getattr(route.project_numpy(states + sign * step * direction), name)
 
     slope = (value(1) - value(-1)) / (2 * step)
-    np.testing.assert_allclose((found * direction).sum(1), slope, atol=1e-6)
+    np.testing.assert_allclose((gradient * direction).sum(1), slope, atol=1e-6)
 
 
 @pytest.mark.parametrize("route", ROUTES, ids=lambda route: route.name)

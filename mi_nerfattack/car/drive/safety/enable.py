@@ -11,7 +11,7 @@ from pathlib import Path
 from mi_nerfattack.car.devices import AbstractEnable, Clock
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
-from mi_nerfattack.ranges import Seconds, Whole
+from mi_nerfattack.ranges import Natural, Seconds
 
 _EVENT = struct.Struct("=IhBB")  # milliseconds, value, type, number
 _BUTTON, _INITIAL = 0x01, 0x80
@@ -72,13 +72,13 @@ class JoystickEnable(AbstractEnable):
     def __init__(
         self,
         path: str,
-        button: Whole,
+        button: Natural,
         clock: Clock,
         silence_s: Seconds | None = None,
         inputs: Path = Path("/sys/class/input"),
     ) -> None:
         self._button, self._clock, self._silence_s = button, clock, silence_s
-        self._is_pressed, self._heard_s, self._rest = False, clock(), b""
+        self._is_pressed, self._heard_s, self._tail = False, clock(), b""
         self._descriptor: int | None = None
         if not hasattr(os, "O_NONBLOCK"):
             raise InputError(f"{path}: joysticks are read on Linux alone")
@@ -122,9 +122,9 @@ class JoystickEnable(AbstractEnable):
                     self.close()
                 return
             self._heard_s = self._clock()
-            data = self._rest + data
-            whole = len(data) - len(data) % _EVENT.size
-            self._rest = data[whole:]
-            for _, value, kind, number in _EVENT.iter_unpack(data[:whole]):
+            data = self._tail + data
+            end = len(data) - len(data) % _EVENT.size
+            self._tail = data[end:]
+            for _, value, kind, number in _EVENT.iter_unpack(data[:end]):
                 if kind & ~_INITIAL == _BUTTON and number == self._button:
                     self._is_pressed = value == 1

@@ -95,11 +95,11 @@ def car_corners(car: Car, body_to_world: np.ndarray) -> np.ndarray:
     return corners @ body_to_world[:2, :2].T + body_to_world[:2, 3]
 
 
-def _points(given: Any) -> np.ndarray:
+def _points(corners: Any) -> np.ndarray:
     try:
-        points = np.array(given, np.float64)
+        points = np.array(corners, np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"fence: {given!r}; needs corners x, y in metres") from error
+        raise InputError(f"fence: {corners!r}; needs corners x, y in metres") from error
     if points.ndim != 2 or points.shape[1:] != (2,) or len(points) < 3:
         raise InputError(
             f"fence: shape {points.shape}; needs (n, 2), at least 3 corners x, y"

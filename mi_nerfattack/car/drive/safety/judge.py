@@ -143,7 +143,7 @@ class Judge:
         """Judge the newest pose, and where it is."""
         limit = self.ages.pose_s
         if pose is None or not _is_fresh(now_s - pose.time_s, limit):
-            age = "none came" if pose is None else _told(now_s - pose.time_s, limit)
+            age = "none came" if pose is None else _age_text(now_s - pose.time_s, limit)
             raise Stop(
                 Cause.POSE_OLD, f"the newest pose: {age}; {tracker.explain(body)}"
             )
@@ -164,8 +164,8 @@ class Judge:
         if values is None:
             raise Stop(Cause.MOTOR_LOST, "it has said nothing")
         if values.fault:
-            found = f"{values.fault_name} (number {values.fault})"
-            raise Stop(Cause.MOTOR_FAULT, found)
+            message = f"{values.fault_name} (number {values.fault})"
+            raise Stop(Cause.MOTOR_FAULT, message)
         if values.is_killed:
             raise Stop(Cause.MOTOR_KILLED, "that of the motor controller is pressed")
         if (volts := values.input_voltage_v) is not None:
@@ -213,14 +213,14 @@ def _check_age(
     if time_s is None:
         raise Stop(cause, f"{what}: none came")
     if not _is_fresh(now_s - time_s, limit_s):
-        raise Stop(cause, f"{what}: {_told(now_s - time_s, limit_s)}")
+        raise Stop(cause, f"{what}: {_age_text(now_s - time_s, limit_s)}")
 
 
 def _is_fresh(age_s: float, limit_s: float) -> bool:
     return -_AHEAD_S <= age_s <= limit_s  # not of NaN
 
 
-def _told(age_s: float, limit_s: float) -> str:
+def _age_text(age_s: float, limit_s: float) -> str:
     if age_s < 0:
         return f"its time is {-age_s:.3f} s ahead; the clocks differ"
     return f"{age_s:.3f} s old, at most {limit_s:g} s"

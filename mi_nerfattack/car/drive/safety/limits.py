@@ -30,22 +30,24 @@ class Limits:
     acceleration_ms2: Positive
     steering_rate: Positive
 
-    def apply(self, wanted: Command, before: Command, elapsed_s: float) -> Command:
+    def apply(self, request: Command, before: Command, elapsed_s: float) -> Command:
         """Return the command nearest to the wanted one that may be sent.
 
         Args:
-            wanted: by the policy and the speed set.
+            request: by the policy and the speed set.
             before: what was sent last.
             elapsed_s: since then.
 
         Raises:
             InputError: a number is not finite.
         """
-        if not (math.isfinite(wanted.speed_ms) and math.isfinite(wanted.steering_rad)):
-            raise InputError(f"command: {wanted}; must be finite")
-        speed = min(max(wanted.speed_ms, 0.0), self.speed_ms)
-        side = math.copysign(self.steering_rad, wanted.steering_rad)
-        angle = min(wanted.steering_rad, side, key=abs)
+        if not (
+            math.isfinite(request.speed_ms) and math.isfinite(request.steering_rad)
+        ):
+            raise InputError(f"command: {request}; must be finite")
+        speed = min(max(request.speed_ms, 0.0), self.speed_ms)
+        side = math.copysign(self.steering_rad, request.steering_rad)
+        angle = min(request.steering_rad, side, key=abs)
         return Command(
             _towards(before.speed_ms, speed, self.acceleration_ms2 * elapsed_s),
             _towards(before.steering_rad, angle, self.steering_rate * elapsed_s),

@@ -110,10 +110,10 @@ def _above(speed_ms: float) -> float:
     return max((1 + _SHARE) * speed_ms, speed_ms + _LEAST_MS)
 
 
-def _append(kept: deque, item: tuple[float, ...]) -> None:
+def _append(history: deque, item: tuple[float, ...]) -> None:
     """Append what is newer than the last, and drop what is too old."""
-    if kept and item[0] <= kept[-1][0]:
+    if history and item[0] <= history[-1][0]:
         return
-    kept.append(item)
-    while item[0] - kept[0][0] > _KEPT_S:
-        kept.popleft()
+    history.append(item)
+    while item[0] - history[0][0] > _KEPT_S:
+        history.popleft()
