@@ -123,13 +123,13 @@ class GradientAttack(AbstractAttack):
         moved = self.sensor.pose_keys if self.freedom.pose_rate is not None else ()
         with self._as_one_level():
             self._install()
-            evaluation = self.rollout.run(self.initial, on_step)
+            evaluation = self.rollout.run(self.initial, on_step)  # forward: the drive
             record = self._record(evaluation)
             rollout = self.plan.followed(self.rollout, self._objectives)
-            gradient = rollout.gradient(evaluation, moved, on_step=on_step)
+            gradient = rollout.gradient(evaluation, moved, on_step=on_step)  # A.9, A.11
         values = self._values(gradient)
-        self.is_consistent = False
-        gain = self._update(values)
+        self.is_consistent = False  # an interrupt would leave half an update
+        gain = self._update(values)  # Adam's step, then the projection
         self.history.append(record)
         self.predicted_gains.append(gain)
         self.is_consistent = True
@@ -151,9 +151,9 @@ class GradientAttack(AbstractAttack):
         """Return what a try starts from; None for the best of all tries."""
         opening = self.plan.opening
         if number is None or opening is None:
-            values, offsets = dict(self._best), self.best_offsets
+            values, offsets = dict(self._best), self.best_offsets  # after the opening
         else:
-            values = {key: c.start for key, c in self._colourings.items()}
+            values = {key: c.start for key, c in self._colourings.items()}  # a new try
             if (looks := opening.textures(number)) is not None:
                 for key, c in self._colourings.items():
                     values[key] = c.near(looks[int(key)])
@@ -273,18 +273,18 @@ class GradientAttack(AbstractAttack):
 
     def _update(self, gradients: Parameters) -> float:
         """Step; return the gain that the gradients predict."""
-        for key, value in gradients.items():
+        for key, value in gradients.items():  # objects that the cost depends on
             if key == OFFSETS:
                 self._depended |= value.any(axis=1)
             else:
                 self._depended[int(key)] |= value.any()
-        before = {key: self._value(key) for key in gradients}
+        before = {key: self._value(key) for key in gradients}  # to predict the gain
         scale = self.plan.gradient_scale(list(gradients.values()))
         values = {
             key: self._colourings[key].smoothed(value) if key != OFFSETS else value
             for key, value in gradients.items()
         }
-        share = self.plan.rate(self._objectives)
+        share = self.plan.rate(self._objectives)  # of the full learning rates
         full = self.freedom.texture_rate or 0.0, self.freedom.pose_rate or 0.0
         rates = {key: share * full[key == OFFSETS] for key in values}
         self.optimiser.set_learning_rate(rates)
@@ -361,7 +361,7 @@ class GradientAttack(AbstractAttack):
         for key in [key for key in self.optimiser if f"value.{key}" in tensors]:
             name, moved = f"value.{key}", key == OFFSETS
             project = (self.freedom if moved else self._colourings[key]).project
-            allowed = {**tensors, name: project(tensors[name])}
+            allowed = {**tensors, name: project(tensors[name])}  # within the new limits
             load_adam(self.optimiser, allowed, [key])
             if moved:
                 self.best_offsets = project(tensors["best_offsets"])

@@ -261,5 +261,6 @@ class DepartureTime(AbstractObjective):
 def _log_sigmoid(x: Any) -> Any:
     """Compute ``-log(1 + exp(-x))`` without overflow, with its derivative at 0, too."""
     positive = x > 0
+    # |x|, by the same mask as below, so that the derivative at 0 is 1/2
     size = dr.select(positive, x, -x)
     return dr.select(positive, 0, x) - dr.log(1 + dr.exp(-size))

@@ -43,6 +43,7 @@ class Schedule:
         turn = self._turn(objectives)
         if turn is None:
             return 1.0
+        # An exponential fall, which reaches the final rate after `_fall` iterations
         return float(self.final_rate ** ((len(objectives) - turn + 1) / _fall(turn)))
 
     def is_over(self, objectives: Sequence[float]) -> bool:
@@ -101,6 +102,7 @@ def _settled_after(objectives: Sequence[float]) -> np.ndarray:
     settled = np.zeros(len(objectives) + 1, bool)
     done = np.arange(_FEWEST, len(objectives) + 1)
     if len(done):
+        # The total gain and the gain of the last fifth, for every count of iterations
         best = np.minimum.accumulate(objectives)
         last = best[done - 1]
         gain, late = best[0] - last, best[done - 1 - done // 5] - last
@@ -179,6 +181,7 @@ class Plan:
             objectives: of the iterations that are done.
         """
         done = len(objectives)
+        # Whether the images of this iteration follow the state, or stop there (A.12)
         if self.follow == "in_turns":
             attached = done > self.tried and (done - self.tried) % 2 == 1
         else:
@@ -230,11 +233,14 @@ class Plan:
             objectives: of the iterations that are done.
         """
         last, done = self._last(objectives), len(objectives)
+        # Iterations before the last part; none unless `follow` is "second_half"
         ends = [(self.tried, done if last is None else last, last is not None)]
         if last is not None:
+            # The last part, up to the iteration in which its rates begin to fall
             schedule, part = self._schedule(last), _part(objectives, last)
             settled = schedule.has_converged(part)
             ends.append((last, last + schedule.full(part), settled))
+        # The last fifth of a part that settled was to gain nothing, so it is left out
         ranges = []
         for start, end, settled in ends:
             cut = settled and has_settled(_part(objectives[:end], start))
@@ -276,6 +282,7 @@ class Plan:
         done = len(objectives)
         turn = self.tried
         if self.follow == "second_half":
+            # The first half ends where the attack settles, or after `half` iterations
             half = self.schedule.max_iterations // 2
             first = _part(objectives[: turn + half], turn)
             settled = np.flatnonzero(_settled_after(first))

@@ -216,6 +216,7 @@ class DepthComposite(AbstractComposite):
     ) -> Marches:
         """See :meth:`AbstractComposite.forward`."""
         mode, none = dr.ADMode.Forward, March()
+        # From the parameters to each layer by itself
         tangents = [
             _derive(mode, item, rays, layer, none, stop)[0]
             if item.has_gradients
@@ -223,6 +224,7 @@ class DepthComposite(AbstractComposite):
             for item, layer in zip(rays.light(posed), primal.layers, strict=True)
         ]
         with dr.resume_grad():
+            # From the layers to the total, through the folds (A.6)
             leaves = [layer.copy() for layer in primal.layers]
             dr.enable_grad(leaves)
             for leaf, tangent in zip(leaves, tangents, strict=True):
@@ -264,7 +266,9 @@ class DepthComposite(AbstractComposite):
         """See :meth:`AbstractComposite.backward_rays`."""
         lit = rays.light(posed)
         fields_by_rays([lit[k] for k in layers])
+        # From the total to each layer, through the folds (A.6)
         by_layer = self._cotangents(primal, cotangent)
+        # From each layer to its parameters and rays: now its march is replayed
         mode = dr.ADMode.Backward
         return [
             _derive(mode, lit[k], rays, primal.layers[k], by_layer[k], stop, True)[1]
@@ -274,6 +278,7 @@ class DepthComposite(AbstractComposite):
     def _cotangents(self, primal: Marches, cotangent: Marches) -> list[March]:
         """Return the derivatives of the objective by each layer."""
         with dr.resume_grad():
+            # Now the layers are folded again, attached
             leaves = [layer.copy() for layer in primal.layers]
             dr.enable_grad(leaves)
             result = depth_composite(leaves).pair(cotangent.total)
@@ -335,7 +340,7 @@ def depth_composite(layers: list[March]) -> March:
     Source: appendix A.4 to A.6.
     """
     ordered = sort_by_depth(layers)
-    # Back to front: I = I_f + (1 - a_f) I_b
+    # Back to front (A.6): I = I_f + (1 - a_f) I_b
     result = ordered[-1]
     for front in reversed(ordered[:-1]):
         result = front.over(result)
@@ -351,6 +356,7 @@ def sort_by_depth(layers: list[March]) -> list[March]:
     depths = [dr.detach(layer.depth) for layer in ordered]
     for end in range(len(ordered) - 1, 0, -1):
         for i in range(end):
+            # The nearer of two neighbours is f, the other one is b (A.4, A.5)
             swap = depths[i + 1] < depths[i]
             a, b = ordered[i], ordered[i + 1]
             ordered[i], ordered[i + 1] = dr.select(swap, b, a), dr.select(swap, a, b)

@@ -195,6 +195,7 @@ class RayGradient:
         self, point: Any, heading: Any, growth: mi.Float, segment: Segment
     ) -> RayGradient:
         """Add what a sample's point and heading got, and its `Slope.growth`."""
+        # A point o + t d moves with its origin, and by t times its direction
         by_point = dr.select(segment.active, mi.Vector3f(dr.grad(point)), 0)
         by_heading = dr.select(segment.active, dr.grad(heading), 0)
         return RayGradient(
@@ -206,6 +207,7 @@ class RayGradient:
 
     def in_world(self, posed: PosedField, path: Path) -> RayGradient:
         """Return the derivatives by origin and direction in the world."""
+        # Through the normalisation h = d / |d|: its derivative is (1 - h h^T) / |d|
         along = path.heading * dr.dot(path.heading, self.heading)
         turned = (self.heading - along) * dr.rcp(dr.norm(path.d))
         by_origin, by_direction = posed.to_world_gradient(
@@ -243,6 +245,7 @@ def replay(  # noqa: D417  one entry describes four
     remainder, tangent = Remainder.of(primal), March()
     by_rays = [RayGradient() for _ in posed]
     while active:
+        # The same sample as in the forward pass
         walk, segment = walk.next(posed, active)
         with dr.resume_grad():
             # The fields again at the sample, attached to their parameters
@@ -269,6 +272,7 @@ def replay(  # noqa: D417  one entry describes four
                     by_rays[k].plus(points[k], headings[k], growth[k], segment)
                     for k in count
                 ]
+        # The same termination as in the forward pass
         active = segment.active & (dr.exp(-remainder.tau) > stop)
     return tangent, list(map(RayGradient.in_world, by_rays, posed, walk.paths))
 

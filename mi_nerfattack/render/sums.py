@@ -27,9 +27,11 @@ def absorption(x: mi.Float) -> tuple[mi.Float, mi.Float]:
     loses the digits that thin media live on.
     """
     small = x < 0.1
+    # The closed form, without a division by 0
     safe = dr.select(small, 1, x)
     passed = dr.exp(-safe)
     phi = (1 - passed) / safe
+    # Taylor series around 0, of phi and of its derivative
     series = 1 + x * (-1 / 2 + x * (1 / 6 + x * (-1 / 24 + x / 120)))
     slope = -1 / 2 + x * (1 / 3 + x * (-1 / 8 + x * (1 / 30 - x / 144)))
     return (
@@ -71,6 +73,7 @@ class Sums:
             t: (n,), position of the sample, metres.
         """
         x = sum(depths, mi.Float(0))
+        # A.1 to A.3 are sums of w L, w and w t, with the weights w = T phi(x) x_k
         attenuation = dr.exp(-self.tau) * absorption(x)[0]
         shares = []
         for share, depth, colour in zip(self.shares, depths, colours, strict=True):
@@ -84,6 +87,7 @@ class Sums:
     def march(self) -> March:
         """Return what the rays of a single field gathered."""
         (share,) = self.shares
+        # 1 - exp(-tau), the opacity of A.2, without the rounding of a sum
         opacity = self.tau * absorption(self.tau)[0]
         return March(share.radiance, opacity, share.moment)
 
@@ -119,6 +123,7 @@ class Remainder:
         through, behind = dr.exp(-self.tau), dr.exp(-self.tau - x)
         phi, d_phi = absorption(x)
         attenuation = through * phi
+        # Without the sample's part, the remainder is all that lies behind the sample
         remainder = Remainder(
             self.tau + x,
             self.radiance - attenuation * light,
@@ -172,6 +177,7 @@ class Slope:
             depths: as given to :meth:`change`.
             colours: as given to :meth:`change`.
         """
+        # dJ/d ln x_k = x_k dJ/dx_k: a shared term, and the light that field k adds
         shared = cotangent.pair(self.by_depth)
         pairs = zip(depths, colours, strict=True)
         return [

@@ -57,6 +57,7 @@ class Path:
         o, d = posed.to_local(rays.origin, rays.direction)
         near, far = posed.interval(o, d, rays.t_max)
         meets = near < far
+        # The path begins at the last lattice point before the box
         first = dr.select(meets, dr.floor(posed.lattice_index(near)), 0)
         begin = posed.lattice(first)
         path = Path(o + begin * d, d, dr.normalize(d), begin, first)
@@ -163,15 +164,18 @@ def seek(
     searching = mi.Bool(active)
     hit = mi.Bool(False)
     while searching:
+        # The interval, cut at the ends of the path, and the sample in it
         start = dr.maximum(path.edge(posed, index), path.near)
         end = dr.minimum(path.edge(posed, index + 1), path.far)
         s = start + jitter * (end - start)
         width = end - start
         searching &= (start < path.far) & (index < MAX_INTERVALS)
+        # The search ends where the sample lies in an occupied cell
         unit = posed.field.unit(mi.Point3f(path.o + s * path.d))
         distance, cell = occupancy.query(unit, searching)
         hit = searching & (distance == 0)
         searching &= ~hit
+        # Otherwise the search jumps over the empty block, by one interval at least
         rate = posed.field.unit_vector(path.d)
         leaving = s + occupancy.exit(unit, rate, cell, distance)
         jump = dr.maximum(index + 1, path.interval(posed, leaving))
@@ -209,6 +213,7 @@ class Cursor:
         start = dr.maximum(path.edge(posed, index), path.near) + path.begin
         end = dr.minimum(path.edge(posed, index + 1), path.far) + path.begin
         end = dr.maximum(end, start)
+        # A cursor without a further interval waits at infinity
         start, end = dr.select(hit, start, dr.inf), dr.select(hit, end, dr.inf)
         return Cursor(
             dr.select(spent, index + 1, self.following),
@@ -245,16 +250,19 @@ class MergedWalk:
         self, posed: Sequence[PosedField], active: mi.Bool
     ) -> tuple[MergedWalk, Segment]:
         """Go on to the next segment that a field covers."""
+        # Cursors whose interval lies behind t move on to their next occupied interval
         fields = zip(self.cursors, posed, self.paths, strict=True)
         cursors = [
             cursor.advance(item, path, self.t, self.jitter, active)
             for cursor, item, path in fields
         ]
+        # The segment begins at t, or at the nearest interval if all lie ahead
         nearest = mi.Float(dr.inf)
         for cursor in cursors:
             nearest = dr.minimum(nearest, cursor.start)
         active = active & (nearest < dr.inf)
         begin = dr.maximum(self.t, nearest)
+        # The segment ends at the next point where a field begins or ends
         end = mi.Float(dr.inf)
         inside = []
         for cursor in cursors:
@@ -329,6 +337,7 @@ def _enclose(
     begin, rate = Range(), Range()
     k = mi.UInt32(0)
     while k < BUNDLE:
+        # Ray k of every bundle; the last bundle repeats the last ray
         place = dr.minimum(first + k, last)
         ray = pick_rays([rays.origin, rays.direction], place)
         o, d = posed.to_local(ray[0], ray[1])

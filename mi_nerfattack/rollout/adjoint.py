@@ -75,6 +75,7 @@ class Replay(AbstractAdjoint):
     def visit(self, loop: ClosedLoop, drive: Trajectory) -> Iterator[Step]:
         """See :meth:`AbstractAdjoint.visit`."""
         for index in reversed(range(drive.horizon)):
+            # Now the frame is rendered again
             observation = drive.observe(loop.sensor, index)
             yield Step(index, drive.states[index], observation, drive.tape[index])
 
@@ -104,6 +105,7 @@ class KeptBackgrounds(AbstractAdjoint):
         sensor = differentiable(loop)
         for index in reversed(range(drive.horizon)):
             record, memory = drive.tape[index]
+            # Now the frame is restored from the record, without a march
             observation = drive.restore(sensor, index, record)
             yield Step(index, drive.states[index], observation, memory)
 

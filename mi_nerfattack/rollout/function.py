@@ -205,6 +205,7 @@ class Rollout:
         Returns:
             one entry, attached to whatever of both is. Reverse mode only.
         """
+        # Attached parameters are inputs of the operation; the others are constants
         every = dict(values.items())  # also of Mitsuba's parameters and optimisers
         attached = {k: v for k, v in every.items() if dr.grad_enabled(v)}
         others = {k: v for k, v in every.items() if k not in attached}
@@ -225,6 +226,7 @@ class _RolloutOp(dr.CustomOp):
     def eval(self, held: _Held, values: dict[str, Any], initial: Any) -> Any:
         self.rollout = held.rollout
         self.keys = list(values)
+        # Detached values, so that Dr.Jit records no graph of the drive
         self.values = dict(held.constants)
         self.values |= {key: type(v)(dr.detach(v)) for key, v in values.items()}
         with self._installed():
@@ -233,6 +235,7 @@ class _RolloutOp(dr.CustomOp):
 
     def backward(self) -> None:
         scale = float(dr.detach(self.grad_out())[0])
+        # Now the costates are solved for and the gradient is summed up (A.9, A.11)
         with self._installed():  # others may have driven
             gradient = self.rollout.gradient(self.evaluation, scale=scale)
         self.set_grad_in("values", gradient.parameters)

@@ -64,6 +64,7 @@ class StateHistory:
     @property
     def final(self) -> Any:
         """State of each vehicle after the last control period, (m, n)."""
+        # Entry i T + T - 1 is the last state of vehicle i
         vehicle = dr.arange(dr.uint32_array_t(self._row), self.count)
         index = vehicle * self.horizon + (self.horizon - 1)
         rows = [self.rows[i] for i in range(len(self.rows))]
@@ -237,11 +238,13 @@ class Worst(AbstractReduction):
 def _tail_mean(costs: Any, mass: float) -> Any:
     """Average the `mass` largest of n costs; compares all pairs, n^2 entries."""
     count, values = dr.width(costs), dr.detach(costs)
+    # For each drive: how many drives cost more, and how many cost the same
     pair = dr.arange(dr.uint32_array_t(type(values)), count * count)
     own = dr.gather(type(values), values, pair // count)
     other = dr.gather(type(values), values, pair % count)
     greater = _count(other > own, own, count)
     equal = _count(other == own, own, count)  # itself included
+    # Drives of equal cost share what the costlier drives leave of the mass
     weight = dr.clip(mass - greater, 0, equal) / (equal * mass)
     return dr.sum(weight * costs)
 
@@ -280,6 +283,7 @@ class Cost:
             return self.reduction.reduce(self.objective.evaluate(states))
 
         by_rows = np.array(vjp(cost, history.rows, self.scale), np.float64)
+        # From (m, n T) to (T, n, m), with zeros for rows that no cost sees
         shape = (len(by_rows), history.count, history.horizon)
         unseen = len(drive.states[0]) - len(by_rows)
         by_states = by_rows.reshape(shape).transpose(2, 1, 0)

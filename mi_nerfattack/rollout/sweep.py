@@ -81,6 +81,7 @@ class StepRecorder:
         """Record one period from the sums so far; periods come last one first."""
         sums = [t.numpy().ravel().copy() for t in textures]
         before = self._before or [np.zeros_like(value) for value in sums]
+        # What this period added to the sum of A.11
         gradients = [value - old for value, old in zip(sums, before, strict=True)]
         self._before = sums
         if self.on_period is not None:
@@ -189,6 +190,7 @@ class Sweep:
         controls = self.drive.controls[: index + 1]
         acting = transition.controls(controls, index, state)
         d_state, *d_acting = transition.vjp(state, acting, d_after)
+        # With a delay, controls of earlier periods act here: their derivatives wait
         sources = transition.sources(index, state)
         for source, value in zip(sources, d_acting, strict=True):
             self.pending[source] = self.pending.get(source, 0) + value
@@ -216,7 +218,7 @@ class Sweep:
             self.d_memory,
             numbers[-1],
         )
-        release_heap()
+        release_heap()  # or memory grows with the horizon
         if d_numbers is not None:
             by_numbers = loop.numbers_vjp(last.state, last.index, d_numbers)
         for step, d_image in zip(steps, _unbatch(d_images, len(steps)), strict=True):
@@ -265,7 +267,7 @@ def backward(
         InputError: attached, along a camera path.
     """
     sensor = differentiable(loop)
-    alone = options.attached or options.recorder is not None
+    alone = options.attached or options.recorder is not None  # one period at a time
     together = 1 if alone else max(1, IMAGES // drive.count)
     if options.recorder is not None and not sensor.textures():
         raise InputError(
@@ -273,7 +275,7 @@ def backward(
             "parameters have none"
         )
     sweep = Sweep(loop, drive, options.attached, together)
-    d_before, costates = to_state(np.zeros_like(d_states[0])), []
+    d_before, costates = to_state(np.zeros_like(d_states[0])), []  # l_{T+1} = 0 (A.10)
     try:
         sensor.start_gradient(options.extra_keys)
         for step in visits:
@@ -286,6 +288,7 @@ def backward(
                 options.recorder.add(step.index, sensor.texture_gradients())
             if options.on_step is not None:
                 options.on_step(step.index)
+        # Now the images that still wait; then the sum of A.11 is complete
         sweep.finish()
         sweep.finish_still()
         textures, parameters = sensor.texture_gradients(), sensor.gradients()
@@ -343,7 +346,7 @@ def backward_to_images(
                 observation = drive.observe(sensor, index)
                 step = Step(index, state, observation, drive.tape[index])
                 d_before = sweep.back(step, d_after)
-            else:
+            else:  # the vehicle alone
                 d_before = sweep.back_blindly(index, state, d_after)
                 dr.eval(d_before, sweep.pending)
     finally:

@@ -128,6 +128,7 @@ def soft_limit(value: Any, limit: Any) -> Any:
     inside = dr.abs(ratio) < 1
     # Of the ratio and its inverse the one that is at most 1: nothing overflows.
     small = dr.select(inside, ratio, 1 / dr.select(inside, 1, ratio))
+    # (1 + small^8)^(-1/8), by squares and square roots alone
     scale = 1 / dr.sqrt(dr.sqrt(dr.sqrt(1 + dr.square(dr.square(dr.square(small))))))
     return limit * scale * dr.select(inside, ratio, dr.sign(ratio))
 
@@ -284,7 +285,7 @@ class Dubins(AbstractDynamics):
     def derivative(self, state: Any, control: Any) -> Any:
         """Compute (3, n) from state (3, n) and heading rate (n,) in rad/s."""
         sin, cos = dr.sincos(state[2])
-        return type(state)(self.speed * cos, self.speed * sin, control)
+        return type(state)(self.speed * cos, self.speed * sin, control)  # A.7
 
     def saturate(self, control: Any) -> Any:
         """Limit the heading rate (n,) with `soft_limit`."""
@@ -315,7 +316,7 @@ class Ackermann(AbstractDynamics):
     def derivative(self, state: Any, control: Any) -> Any:
         """Compute (3, n) from state (3, n) and steering angle (n,) in radians."""
         sin, cos = dr.sincos(state[2])
-        heading_rate = self.speed / self.wheelbase * dr.tan(control)
+        heading_rate = self.speed / self.wheelbase * dr.tan(control)  # A.8, corrected
         return type(state)(self.speed * cos, self.speed * sin, heading_rate)
 
     def saturate(self, control: Any) -> Any:

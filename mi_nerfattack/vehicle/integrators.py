@@ -38,8 +38,10 @@ def solve_columns(columns: list[Any], right: Any) -> Any:
     # Augmented rows; those above the diagonal are final.
     rows = [[c[i] for c in columns] + [right[i]] for i in range(size)]
     for k in range(size):
+        # The row with the largest entry in column k becomes the pivot
         for i in range(k + 1, size):
             rows[k], rows[i] = _larger_first(rows[k], rows[i], k)
+        # Eliminate column k from the rows below it
         for i in range(k + 1, size):
             factor = rows[i][k] / rows[k][k]
             for j in range(k + 1, size + 1):
@@ -147,6 +149,7 @@ class ImplicitMidpoint(AbstractIntegrator):
 
     def step(self, dynamics: AbstractDynamics, x: Any, u: Any, dt: float) -> Any:
         """Advance (m, n) by dt seconds; call `check` with the result."""
+        # Newton's method on G(x_prev, x, u) = 0, with all inputs detached
         x_prev, control = dr.detach(x), dr.detach(u)
         x_next = type(x_prev)(x_prev)  # an Euler step overshoots in stiff models
         for _ in range(self.iterations):
@@ -321,6 +324,7 @@ class Transition:
         shares = self.shares(state)
         if shares is None:
             return self.dynamics.saturate(controls[0 if step < self.late else 1])
+        # The mean of the controls that arrive in the step, by their shares
         first, *others = zip(shares.weights[step], controls, strict=True)
         command = first[0] * first[1]
         for weight, control in others:
@@ -374,8 +378,10 @@ class Shares:
         later, earlier = (
             -((step - n) // substeps) for n in (full_steps, full_steps + 1)
         )
+        # The range of ages over all vehicles and steps
         newest, oldest = int(later.min()), int(earlier.max())
         ages = np.arange(oldest, newest - 1, -1)[:, None]
+        # 1 - f of the later control, f of the earlier one
         weights = [
             [
                 kind(row.tolist())

@@ -173,6 +173,7 @@ class DynamicSingleTrack(AbstractSingleTrack):
         """Largest rate of decay of the model at rest, 1/s."""
         stiffness = np.array([self.front_stiffness, self.rear_stiffness])
         arms = np.array([self.front_m, -self.rear_m])
+        # The tyres' slip at v = 0, linearised: d(w, r)/dt = -matrix (w, r) / low_speed
         sideways, mixed = stiffness.sum() / self.mass, stiffness @ arms
         turning = stiffness @ arms**2 / self.yaw_inertia
         matrix = [[sideways, mixed / self.mass], [mixed / self.yaw_inertia, turning]]
@@ -188,12 +189,14 @@ class DynamicSingleTrack(AbstractSingleTrack):
         # speeds of the front axle, in the frame of its wheels
         ahead = left + self.front_m * rate
         rolling, sliding = along * cos_u + ahead * sin_u, ahead * cos_u - along * sin_u
+        # loads of the axles at rest, and the lateral forces of their tyres
         length = self.front_m + self.rear_m
         load = self.mass * GRAVITY / length
         front = self._force(rolling, sliding, self.front_stiffness, load * self.rear_m)
         rear = self._force(
             along, left - self.rear_m * rate, self.rear_stiffness, load * self.front_m
         )
+        # accelerations along the car, to its left and about the vertical
         driven = longitudinal(along, acceleration, self.stop_speed)
         moment = self.front_m * front * cos_u - self.rear_m * rear
         return type(state)(

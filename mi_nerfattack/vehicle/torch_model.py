@@ -47,6 +47,7 @@ class TorchDynamics(AbstractUserDynamics):
             InputError: it returned something else than a finite tensor (n, m); while
                 differentiating, one that autograd cannot follow to the control.
         """
+        # The value needs no graph: `_Derivative` evaluates again where it needs one
         with torch.no_grad():
             value = _to_state(self.evaluate(*_tensors(state, control)), state)
         if not dr.grad_enabled(state, control):
@@ -56,6 +57,7 @@ class TorchDynamics(AbstractUserDynamics):
     def jacobian(self, state: Any, control: Any) -> list[Any]:
         """Compute the columns of df/dx by m reverse passes over one graph."""
         result, leaves = self._graph(*_tensors(state, control))
+        # A reverse pass gives a row of df/dx; stacked, the last axis counts columns
         rows = [
             self._reverse(result, leaves, unit.expand_as(result))[0]
             for unit in torch.eye(self.size).to(result)

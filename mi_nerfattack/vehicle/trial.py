@@ -54,6 +54,7 @@ def require_model(name: str, dynamics: AbstractDynamics, state: Any, u: Any) -> 
         InputError: values or derivatives are not finite, a derivative is lost, or one
             vehicle depends on another.
     """
+    # A vehicle alone must move as it does among others
     value = _values(dynamics, state, u)
     require_finite(name, value.T)
     alone = _values(dynamics, _first(state), _first(u))
@@ -74,6 +75,7 @@ def require_model(name: str, dynamics: AbstractDynamics, state: Any, u: Any) -> 
                 f"{name}: its derivative by {source} is {derivative[:, 0].tolist()}; "
                 "finite numbers are needed"
             )
+        # A derivative is lost if it is 0 although the central difference is not
         slope = _difference(dynamics, state, u, j)
         lost = (derivative == 0).all(axis=1) & (np.abs(slope) > VISIBLE).any(axis=1)
         if lost.any():

@@ -126,6 +126,7 @@ class FunctionDynamics(AbstractUserDynamics):
             raise InputError(self._expected(description))
         if len(value) != self.size:
             raise InputError(self._expected(f"{len(value)} rows"))
+        # Rows of the state's precision, with one entry per vehicle or one for all
         try:
             rows = [row(item) for item in value]
         except (TypeError, RuntimeError) as err:
@@ -164,6 +165,7 @@ def call_model(
     except Exception as err:
         if is_interrupt(err):
             raise
+        # The first frame below this one is in the user's function
         frames = traceback.extract_tb(err.__traceback__)[1:2]
         line = f" in line {frames[0].lineno}" if frames else ""
         raise InputError(

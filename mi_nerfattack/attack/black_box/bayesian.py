@@ -39,8 +39,10 @@ class BayesianSearch(AbstractSearch):
         optuna = load_extra("optuna", "Bayesian optimisation")
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         self.basis = basis
+        # Random proposals come first; then the Gaussian process chooses
         sampler = optuna.samplers.GPSampler(seed=seed, n_startup_trials=_RANDOM_FIRST)
         self._study = optuna.create_study(sampler=sampler)
+        # A coefficient changes sRGB values by at most 1
         one = optuna.distributions.FloatDistribution(-1.0, 1.0)
         self._space = {f"{i:02d}": one for i in range(basis.count)}
         self._asked: Trial | None = None

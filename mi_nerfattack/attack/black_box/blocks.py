@@ -62,6 +62,7 @@ class BlockSearch(AbstractSearch):
 
     def ask(self) -> Proposal:
         """See :meth:`AbstractSearch.ask`."""
+        # Blocks all over first; then one new block on the best colours so far
         asked = [value.copy() for value in self._best]
         if self._count == 0:
             for index, colouring in enumerate(self.colourings):
@@ -82,6 +83,7 @@ class BlockSearch(AbstractSearch):
 
     def _scatter(self, colouring: Colours) -> np.ndarray:
         edge = colouring.level.resolution
+        # One random colour for each block; every vertex takes its block's colour
         coarse = self._rng.integers(0, 2, (_FIRST,) * 3 + (3,)).astype(np.float32)
         at = np.arange(edge) * _FIRST // edge
         return coarse[np.ix_(at, at, at)].reshape(-1, 3)
@@ -89,8 +91,10 @@ class BlockSearch(AbstractSearch):
     def _change(self, values: list[np.ndarray]) -> None:
         chosen = int(self._rng.integers(len(values)))
         edge = self.colourings[chosen].level.resolution
+        # The volume of a block halves as the budget is spent
         halvings = int((self._count / self._proposals >= _HALVED_AT).sum())
         side = max(1, round(edge * float(np.cbrt(self._share / 2**halvings))))
+        # The middle is a random point of an occupied cell; the lattice is by z, y, x
         occupied = self._occupied[chosen]
         cell = occupied[self._rng.integers(len(occupied))]
         middle = (cell + self._rng.uniform(size=3)) / self._cells[chosen].shape

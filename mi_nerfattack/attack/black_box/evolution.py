@@ -43,6 +43,7 @@ class EvolutionSearch(AbstractSearch):
         if population is not None and population < 2:
             raise InputError(f"population: {population}; at least 2")
         self.basis = basis
+        # The first mean is the texture that zero coefficients give
         start = np.zeros(basis.count)
         bounds = np.tile([-1.0, 1.0], (basis.count, 1))
         options = {"bounds": bounds, "seed": seed, "population_size": population}

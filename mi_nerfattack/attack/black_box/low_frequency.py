@@ -44,10 +44,12 @@ class LowFrequency:
             )
         self.colourings = colourings
         self._middle = [c.start for c in colourings] if middle is None else middle
+        # A coarse lattice for each object, and its interpolation along every axis
         self._weights = [
             [_weights(c.level.resolution, n) for n in lattice(c.extent, vertices)]
             for c in colourings
         ]
+        # Where the coefficients of one object end and those of the next object begin
         self._ends = np.cumsum([np.prod(_shape(axes)) for axes in self._weights])
         self.count: int = int(self._ends[-1])
 

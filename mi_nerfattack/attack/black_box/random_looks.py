@@ -36,6 +36,7 @@ class RandomLooks:
         """Return a texture an object, None if the attack leaves textures alone."""
         if self.freedom.texture_rate is None:
             return None
+        # A draw depends on the seed and on its number, not on the draws before it
         sequence = np.random.SeedSequence([self.seed, 1, number])
         seeds = sequence.generate_state(len(self.fields))
         return [

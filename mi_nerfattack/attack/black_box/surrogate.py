@@ -54,6 +54,7 @@ class SurrogateJudge:
         """
         sensor = textured(self.rollout.loop)
         sensor.set_textures(list(textures))
+        # The budget counts the frames that this drive makes the sensor render
         before = sensor.renders
         evaluation = self.rollout.measure(self.initial, on_step)
         error = distances(self.route, evaluation)

@@ -120,6 +120,7 @@ class Colours(AbstractColouring):
         self.smoothing = smoothing
         self._field = field
         self._original = field.texture.numpy().copy()
+        # A colour of exactly 0 or 1 has no finite logit
         colours = np.clip(vertex_colours(field, self.level), 1e-4, 1 - 1e-4)
         self._allowed = Allowed(
             constraints or Constraints(), field, self.level, colours
@@ -151,6 +152,7 @@ class Colours(AbstractColouring):
 
     def near(self, texture: np.ndarray) -> np.ndarray:
         """See :meth:`AbstractColouring.near`."""
+        # All levels add up to a colour, so the field takes the texture for a moment
         before = self._field.texture.numpy().copy()
         self._field.set_parameter("texture", texture)
         colours = vertex_colours(self._field, self.level)

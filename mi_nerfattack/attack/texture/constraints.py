@@ -67,6 +67,7 @@ class Constraints:
             raise InputError(
                 f"{named}; expected lowest < highest, {MARGIN} from 0 and 1"
             )
+        # Colours are drawn towards the gamut's centre, so the centre must be allowed
         if self.gamut is not None:
             centre = self.gamut.centre
             if not lowest < centre.min() <= centre.max() < highest:
@@ -106,15 +107,18 @@ class Allowed:
         self._counts = _colouring(field, level)
         self._cube = (n, n, n, 3)
         low, high = constraints.lowest, constraints.highest
+        # The range; by default it includes the original colours, wherever they are
         self._lower = np.minimum(original, np.float32(MARGIN))
         self._upper = np.maximum(original, np.float32(1 - MARGIN))
         if low is not None:
             self._lower = np.full_like(original, max(low, MARGIN))
         if high is not None:
             self._upper = np.full_like(original, min(high, 1 - MARGIN))
+        # The start: the original colours, moved into the range and into the gamut
         self.start: np.ndarray = np.clip(original, self._lower, self._upper)
         if gamut := constraints.gamut:
             self.start = gamut.draw(self.start, gamut.centre).astype(np.float32)
+        # A box around the start; in fixed regions, the start alone
         if constraints.linf is not None:
             self._lower = np.maximum(self._lower, self.start - constraints.linf)
             self._upper = np.minimum(self._upper, self.start + constraints.linf)
@@ -135,11 +139,14 @@ class Allowed:
         """Return colours (n, 3) that are allowed, near to given ones."""
         value = np.clip(value, self._lower, self._upper)
         if gamut := self.constraints.gamut:
+            # Into the gamut, then into the boxes; the second step may leave the gamut
             value = gamut.draw(value, gamut.centre)
             value = np.clip(value, self._lower, self._upper)
+            # Towards the start, which lies in gamut and boxes; both are convex
             value = gamut.draw(value, self.start).astype(np.float32)
         if self.constraints.l2 is None:
             return value
+        # The ball: the change of all colours shrinks by one factor
         change = value - self.start
         square = np.square(change[self._counts], dtype=np.float64).mean()
         size = float(np.sqrt(square))
@@ -163,6 +170,7 @@ class Allowed:
             first, second = neighbours(axis)
             both = (counted[first] & counted[second])[..., None]
             change = np.where(both, cube[second] - cube[first], 0)
+            # The absolute difference, rounded by a parabola around 0
             small = np.abs(change) < _SMALL
             size = np.where(small, change**2 / (2 * _SMALL) + _SMALL / 2, abs(change))
             total += float(size[np.broadcast_to(both, size.shape)].sum())
@@ -202,6 +210,7 @@ def _colouring(field: GridField, level: GridLevel) -> np.ndarray:
     occupied = field.window.cells.transpose()  # by z, y, x
     index = np.arange(level.resolution)
     for axis, count in enumerate(occupied.shape):
+        # A vertex colours the cells between its two neighbours on this axis
         first = np.floor((index - 1) / level.scale * count).clip(0, count - 1)
         last = np.ceil((index + 1) / level.scale * count).clip(1, count)
         ranges = zip(first.astype(int), last.astype(int), strict=True)

@@ -80,6 +80,7 @@ class Gamut:
         inside = np.broadcast_to(inside, colours.shape)
         drawn = colours.copy()
         [moved] = (colours != inside).any(axis=1).nonzero()
+        # In chunks, because every colour is compared with every plane of the hull
         for some in np.array_split(moved, len(moved) // _CHUNK + 1):
             # Signed distances to the hull's planes, positive outside
             near = inside[some] @ self._normals.T + self._offsets
@@ -88,6 +89,7 @@ class Gamut:
             with np.errstate(divide="ignore", invalid="ignore"):
                 share = np.where(far > 0, np.maximum(-near, 0) / (far - near), 1.0)
             least = share.min(axis=1, initial=1.0)[:, None]
+            # A little further inwards, so that rounding leaves no colour outside
             least = np.where(least < 1, _INWARDS * least, 1.0)
             drawn[some] = np.where(
                 least < 1,

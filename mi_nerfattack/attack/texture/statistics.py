@@ -66,6 +66,7 @@ def seen_weights(
         sensor.set_textures(grey)  # where colours change by equal amounts
         sensor.start_gradient()
         for step, state in enumerate(states):
+            # The derivative of the sum of all pixel values, summed over the states
             observation = sensor.observe(state, step)
             ones = dr.ones(mi.TensorXf, observation.image.shape)
             sensor.vjp(observation, state, ones, False)
@@ -93,6 +94,7 @@ def texture_statistics(
     visible = weights > _LEAST_WEIGHT * weights.max(initial=0.0)
     if not visible.any():
         return TextureStatistics(0.0, 0.0, 0.0, 0.0, [])
+    # The colours of both textures, at the vertices that the images show
     colour = vertex_colours(field, field.levels()[-1], visible)
     try:
         field.set_parameter("texture", original)
@@ -118,6 +120,7 @@ def _spectrum(
     What an average over eight neighbours leaves of them is structure of their size; the
     averages are taken apart likewise. The parts' squares add up to that of the whole.
     """
+    # A cube whose edge is a power of two; what is outside the lattice weighs 0
     size = 1 << (max(visible.shape) - 1).bit_length()
     values, weight = np.zeros((size,) * 3 + (3,)), np.zeros((size,) * 3 + (1,))
     inside = tuple(slice(n) for n in visible.shape)
@@ -126,12 +129,14 @@ def _spectrum(
     total = (weight * values**2).sum()
     if not total:
         return []
+    # The weighted square that is left after each average over eight neighbours
     left = [total]
     while len(values) > 1:
         above = _blocks(weight * values)
         weight = _blocks(weight)
         values = np.divide(above, weight, out=above, where=weight > 0)
         left.append((weight * values**2).sum())
+    # What one average removes is structure of the size of its blocks
     return (-np.diff([*left, 0.0]) / total).tolist()
 
 

@@ -90,6 +90,7 @@ def colmap_to_opencv(quaternion: ArrayLike, translation: ArrayLike) -> np.ndarra
         raise InputError(f"quaternion: {q.tolist()}; must be finite and not zero")
     if not (np.abs(t) < np.finfo(np.float32).max).all():
         raise InputError(f"translation: {t.tolist()}; must be finite, below 3.4e38")
+    # World to camera is R x + t, so camera to world is R^T x - R^T t
     unit = (q / largest).reshape(-1, 4)
     flat = Rotation.from_quat(unit, scalar_first=True).as_matrix()
     to_world = np.swapaxes(flat.reshape(*q.shape[:-1], 3, 3), -1, -2)
@@ -214,10 +215,12 @@ def from_mitsuba(sensor: mi.Sensor) -> tuple[Camera, np.ndarray]:
     params = mi.traverse(sensor)
     width, height = map(int, sensor.film().size())
     if "fx" in params:
+        # Our `opencv_camera`: its parameters are named as in COLMAP
         model = "OPENCV_FISHEYE" if "k3" in params else "OPENCV"
         numbers = [_number(params[name]) for name in COLMAP_MODELS[model]]
         camera = from_colmap(model, width, height, numbers)
     elif "x_fov" in params:
+        # A stock camera: a horizontal angle, and offsets in widths and heights
         focal = 0.5 * width / math.tan(math.radians(0.5 * _number(params["x_fov"])))
         shift = [
             _number(params[key]) if key in params else 0.0

@@ -24,6 +24,7 @@ def distort(
     """Return the distorted position of the undistorted (x, y)."""
     r2 = x * x + y * y
     if is_fisheye:
+        # Kannala and Brandt: the radius is a polynomial of the angle to the axis
         r = _library(x).sqrt(r2 + _TINY)
         stretch = bend(_arctan(r), k1, k2, p1, p2)[0] / r
         return x * stretch, y * stretch
@@ -50,6 +51,7 @@ def jacobian(
         xy = along * x * y / r2
         return xx, xy, yy, xx * yy - xy * xy
     radial = 1 + r2 * (k1 + r2 * k2)
+    # dr2/dx = 2 x, so the slope is twice the derivative of `radial` by r2
     slope = 2 * (k1 + 2 * k2 * r2)
     xx = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
     yy = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
@@ -123,6 +125,7 @@ def is_invertible(
             radius, fisheye = np.hypot(u, v), lens[:4]
             angle = unbend(radius, *fisheye)
             error = abs(bend(angle, *fisheye)[0] - radius)
+            # The radius must rise with the angle; 180 degrees and more count as a fold
             inner = np.linspace(0, angle.max(), 500)
             rising = np.where(inner < np.pi, bend(inner, *fisheye)[1], -1.0)
         else:

@@ -184,6 +184,7 @@ def ray_lengths(camera: Camera) -> np.ndarray:
         where a fisheye sees 90 degrees and more from its axis.
     """
     if camera.is_fisheye:
+        # A ray at the angle a to the axis goes 1 / cos(a) per distance along the axis
         u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         x, y = (u + 0.5 - camera.cx) / camera.fx, (v + 0.5 - camera.cy) / camera.fy
         along = direction(x, y, *camera.distortion[:4])[2]
@@ -206,10 +207,12 @@ def look_at(eye: ArrayLike, target: ArrayLike) -> np.ndarray:
     eye = np.asarray(eye, np.float64)
     forward = np.asarray(target, np.float64) - eye
     forward /= np.linalg.norm(forward)
+    # Right is horizontal; a camera that looks straight up or down has +y at the top
     right = np.cross(forward, [0.0, 0.0, 1.0])
     if np.linalg.norm(right) < 1e-6:
         right = np.cross(forward, [0.0, 1.0, 0.0])
     right /= np.linalg.norm(right)
+    # Columns: right, down, forward
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
     matrix[:3, 3] = eye
@@ -266,13 +269,17 @@ def mount_matrix(states: np.ndarray, mount: CameraMount) -> np.ndarray:
     pitch, heading = math.radians(mount.pitch_deg), theta + math.radians(mount.yaw_deg)
     sin_heading, cos_heading = np.sin(heading), np.cos(heading)
     matrix = np.zeros((len(px), 4, 4))
+    # x, to the right: horizontal, at right angles to the camera's heading
     matrix[:, 0, 0], matrix[:, 1, 0] = sin_heading, -cos_heading
+    # y, down: tilted by the pitch
     matrix[:, 0, 1] = -cos_heading * math.sin(pitch)
     matrix[:, 1, 1] = -sin_heading * math.sin(pitch)
     matrix[:, 2, 1] = -math.cos(pitch)
+    # z, the optical axis: along the camera's heading, down by the pitch
     matrix[:, 0, 2] = cos_heading * math.cos(pitch)
     matrix[:, 1, 2] = sin_heading * math.cos(pitch)
     matrix[:, 2, 2] = -math.sin(pitch)
+    # The camera's place turns with the vehicle, not with the camera's yaw
     sin_theta, cos_theta = np.sin(theta), np.cos(theta)
     matrix[:, 0, 3] = px + mount.forward_m * cos_theta - mount.left_m * sin_theta
     matrix[:, 1, 3] = py + mount.forward_m * sin_theta + mount.left_m * cos_theta
