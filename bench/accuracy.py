@@ -104,7 +104,7 @@ def _composites(width: int, height: int) -> Iterator[tuple[str, dict[str, float]
     """Compare composites in the pixels of an object that stands in the road."""
     scene = PosedField(load_field(bundled("intersection/field.safetensors")))
     item = load_field(bundled("hydrant/field.safetensors"))
-    rays = _rays(width, height, 45, look_at(EYE, (*PLACE, 0.9)))
+    rays = _rays(width, height, angle=45, pose=look_at(EYE, (*PLACE, 0.9)))
     ways: tuple[AbstractComposite, ...] = (DepthComposite(), InterleavedComposite())
     for foot in HEIGHTS:
         z = foot - SCALE * float(item.lower[2])
@@ -136,7 +136,7 @@ def _levels(width: int, height: int) -> Iterator[tuple[str, dict[str, float]]]:
         errors, own = [], []
         for turn in np.arange(TURNS) * 2 * np.pi / TURNS:
             eye = 2 * size * np.cos(turn), 2 * size * np.sin(turn), 0.5 * size
-            rays = _rays(width, height, 40, look_at(eye, (0, 0, 0.5 * size)))
+            rays = _rays(width, height, angle=40, pose=look_at(eye, (0, 0, 0.5 * size)))
             pictures, opacities = [], []
             for way in ways:
                 with way():

@@ -44,14 +44,14 @@ class NGPData:
         table = field.parameters()["table"].numpy().copy()
         tensors = {k: v for k, v in tensors.items() if "_net." in k or k == "sky"}
         return NGPData(
-            field.layout,
-            field.lower,
-            field.upper,
-            {"table": table, **tensors},
-            field.occupancy.cells,
-            _octants(field.occupancy),
-            field.step_m,
-            field.cone,
+            layout=field.layout,
+            lower=field.lower,
+            upper=field.upper,
+            tensors={"table": table, **tensors},
+            cells=field.occupancy.cells,
+            octants=_octants(field.occupancy),
+            step_m=field.step_m,
+            cone=field.cone,
         )
 
     def field(self) -> NGPField:

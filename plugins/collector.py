@@ -63,7 +63,7 @@ class RayCollector:
     ) -> list[RayGradient]:
         composite, posed, stop = self._arguments
         return composite.backward_rays(
-            posed, rays, primal, cotangent, stop, self._layers
+            posed, rays, primal, cotangent=cotangent, stop=stop, layers=self._layers
         )
 
     def _rays_state(self, rays: Rays, *arguments: Any) -> list[Any]:

@@ -263,7 +263,7 @@ class FieldIntegrator(FilmIntegrator):
         # I and a of the fields (A.1 to A.6), and L_b behind them
         if state_in is None:  # primal mode, or forward mode, which comes without
             inner = sampler if is_primal else sampler.clone()
-            state_in = look(self, scene, inner, ray, rays, frozen)
+            state_in = look(self, scene, inner, ray=ray, rays=rays, frozen=frozen)
         state: State = state_in
         rays.gains = state.gains
         valid = state.marches.total.opacity > 0
@@ -321,11 +321,11 @@ class FieldIntegrator(FilmIntegrator):
                 self.behind,
                 dr.ADMode.Backward,
                 scene,
-                sampler,
-                mi.Ray3f(dr.detach(ray)),
-                rays.active,
-                δbehind,
-                state.inner,
+                sampler=sampler,
+                ray=mi.Ray3f(dr.detach(ray)),
+                active=rays.active,
+                δL=δbehind,
+                state_in=state.inner,
             )
         # From dJ/dI and dJ/da to densities and colours: a march again, perhaps later
         if not by_camera and not any(item.has_pose_gradients for item in self.posed):

@@ -179,7 +179,9 @@ class _View:
         value, wavelengths = colour * self.weight, self.ray.wavelengths
         if mi.has_flag(self.film.flags(), mi.FilmFlags.Special):
             count = block.channel_count()
-            return self.film.prepare_sample(value, wavelengths, count, 1.0, alpha)
+            return self.film.prepare_sample(
+                value, wavelengths, count, weight=1.0, alpha=alpha
+            )
         if mi.is_spectral:
             value = mi.spectrum_to_srgb(value, wavelengths)
         rgb = [value.x] * 3 if mi.is_monochromatic else [*value]

@@ -102,7 +102,12 @@ def look(
     if integrator.behind is None:
         return State(marches, rays.gains)
     behind, valid, aovs, *inner = sample_nested(
-        integrator.behind, dr.ADMode.Primal, scene, sampler, ray, rays.active
+        integrator.behind,
+        dr.ADMode.Primal,
+        scene,
+        sampler=sampler,
+        ray=ray,
+        active=rays.active,
     )
     if light is not None:
         shadow = light.behind(scene, sampler, integrator.posed, ray, rays.active)
@@ -177,7 +182,13 @@ def push_forward(
     if integrator.differentiates_behind:
         nested, mode = integrator.behind, dr.ADMode.Forward
         t_behind, *_ = sample_nested(
-            nested, mode, scene, sampler, ray, rays.active, state_in=state.inner
+            nested,
+            mode,
+            scene,
+            sampler=sampler,
+            ray=ray,
+            active=rays.active,
+            state_in=state.inner,
         )
     with dr.resume_grad():
         leaf = state.copy()

@@ -80,7 +80,7 @@ class Job:
         height, width = IMAGE_SHAPE
         rows = min(self.height, round(self.width * height / width))
         above = (self.height - rows) // 2
-        crop = Crop(above, self.height - rows - above, 0, 0)
+        crop = Crop(top=above, bottom=self.height - rows - above, left=0, right=0)
         return [crop, Resize(width, height)]
 
 

@@ -69,12 +69,12 @@ class OurAttack:
         path = route()
         vehicle = Dubins(SPEED_MS, MAX_HEADING_RATE)
         self.loop = ClosedLoop(
-            sensor,
-            policy,
-            path.goal,
-            vehicle,
-            RK4(),
-            job.dt,
+            sensor=sensor,
+            policy=policy,
+            goal=path.goal,
+            dynamics=vehicle,
+            integrator=RK4(),
+            dt=job.dt,
             eight_bit=False,  # the peer does not round
         )
         self.initial = self.loop.initial(job.initial())

@@ -60,10 +60,10 @@ class TorchAttack:
         self.loop = TorchLoop(
             self.view,
             network(),
-            job.transforms(),
-            path.goal,
-            TorchVehicle(SPEED_MS, MAX_HEADING_RATE, job.dt),
-            TorchRoute(path.points, ROUNDING_M),
+            transforms=job.transforms(),
+            goal=path.goal,
+            vehicle=TorchVehicle(SPEED_MS, MAX_HEADING_RATE, job.dt),
+            route=TorchRoute(path.points, ROUNDING_M),
         )
         self.initial = torch.tensor(job.initial())
         self.optimiser = torch.optim.Adam([self.item.texture], RATE, fused=True)

@@ -47,8 +47,27 @@ class Sizes:
 
 
 FULL = Sizes({"Instant-NGP": NGPLayout(), "small": NGPLayout.small()})
-_TINY = {"tiny": NGPLayout(4, 2, 12, 4, 64, 16)}
-QUICK = Sizes(_TINY, 256, 1 << 12, 30, 9, 32, 16, 1.0, (256,))
+_TINY = {
+    "tiny": NGPLayout(
+        levels=4,
+        features=2,
+        log2_table=12,
+        base_resolution=4,
+        max_resolution=64,
+        width=16,
+    )
+}
+QUICK = Sizes(
+    networks=_TINY,
+    rays=256,
+    samples=1 << 12,
+    train_steps=30,
+    views=9,
+    width=32,
+    height=16,
+    step_m=1.0,
+    chunk=(256,),
+)
 
 
 @dataclass(frozen=True)
@@ -94,7 +113,14 @@ def measure(options: BenchFit, root: Path, show: Progress) -> dict[str, Any]:
             ours.ask("write_pictures", str(root / "pictures.safetensors"))
             for stage in ("early", "late"):
                 name = f"{network}, {stage}"
-                row = _stage(name, ours, root, options.repeats, sizes.chunk, show)
+                row = _stage(
+                    name,
+                    ours,
+                    root,
+                    repeats=options.repeats,
+                    chunk=sizes.chunk,
+                    show=show,
+                )
                 rows.append({"network": network, "stage": stage, **row})
                 for done in range(0, sizes.train_steps, TURN_STEPS):
                     if stage == "early":

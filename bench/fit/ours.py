@@ -120,7 +120,7 @@ def pictures_of(images: PosedImages, indices: np.ndarray) -> Pictures:
     colour, direction = [], []
     for index in indices:
         origin, rotation = pose_arrays(images.camera_to_world[index])
-        rays = generate_rays(images.camera_of(index), origin, rotation, 1)[1]
+        rays = generate_rays(images.camera_of(index), origin, rotation, n_poses=1)[1]
         direction.append(rays.numpy().T.astype(np.float32))
         colour.append(images.images[index][..., :3].reshape(-1, 3))
     centre = images.camera_to_world[indices, :3, 3].astype(np.float32)

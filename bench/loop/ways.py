@@ -199,7 +199,13 @@ class RolloutLoop(AbstractLoop):
         driver = TorchPolicy(module, NoGoal())
         # mi.render rounds no image to eight bits
         self.loop = ClosedLoop(
-            self.sensor, driver, 0, CAR, RK4(), PERIOD_S, eight_bit=False
+            sensor=self.sensor,
+            policy=driver,
+            goal=0,
+            dynamics=CAR,
+            integrator=RK4(),
+            dt=PERIOD_S,
+            eight_bit=False,
         )
 
     def value(self, frames: int) -> Any:

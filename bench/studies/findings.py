@@ -124,8 +124,8 @@ def attack(drives: pd.DataFrame) -> Finding:
     errors = pd.DataFrame({n: _by_place(by_case[case]) for case, n in _CASES.items()})
     errors.index = [_name(place) for place in errors.index]
     return Finding(
-        title,
-        (
+        title=title,
+        sentences=(
             f"In the environment `{where}`, the attack moves the car {effect.one:.3f} "
             f"m from the lane centre on average, and the worst random texture "
             f"{effect.other:.3f} m (ratio {effect.ratio:.1f}, "
@@ -137,15 +137,15 @@ def attack(drives: pd.DataFrame) -> Finding:
             f"The difference is {effect.difference:.3f} m on average. Its standard "
             f"deviation between the places of a route is {metres(effect.spread)}.",
         ),
-        [
+        head=[
             *("texture", "environment", "mean error (m)", "95 % interval"),
             "places with a wheel out for 1 s",
         ],
-        rows,
-        lambda figure: draw_places(figure, errors),
-        f'deployed = drives[drives.environment == "{where}"]\n'
+        rows=rows,
+        draw=lambda figure: draw_places(figure, errors),
+        pandas=f'deployed = drives[drives.environment == "{where}"]\n'
         'print(deployed.groupby(["route", "case"]).cross_track_mean_m.mean())',
-        tuple(_threats_to_attack(by_case, effect)),
+        threats=tuple(_threats_to_attack(by_case, effect)),
     )
 
 
@@ -225,8 +225,8 @@ def gradient(drives: pd.DataFrame) -> Finding:
         for name, effect in effects.items()
     ]
     return Finding(
-        title,
-        (
+        title=title,
+        sentences=(
             f"Over {nearest.attacks} places, the gradient moves the car "
             f"{nearest.one:.2f} m from the lane centre on average in the surrogate, "
             f"and is farther than {also} of {len(others)} other searches that use a "
@@ -238,16 +238,16 @@ def gradient(drives: pd.DataFrame) -> Finding:
             "gradient is farther at "
             f"{min(wins)} to {max(wins)} of {nearest.attacks} places.",
         ),
-        [
+        head=[
             *("search", "frames", "mean error (m)", "gradient to search"),
             *("95 % interval", "gradient farther", "difference", "its spread"),
         ],
-        rows,
-        lambda figure: draw_ratios(
+        rows=rows,
+        draw=lambda figure: draw_ratios(
             figure, {n: (e.ratio or 0.0, e.ratio_ci95) for n, e in effects.items()}
         ),
-        _OF_SEARCHES,
-        tuple(_threats_to_gradient(own, frames, list(fair))),
+        pandas=_OF_SEARCHES,
+        threats=tuple(_threats_to_gradient(own, frames, list(fair))),
     )
 
 
@@ -290,8 +290,8 @@ def searches(drives: pd.DataFrame) -> Finding:
     title = "Not yet known which search by gradient is best: one place per route"
     spread = own.groupby("cell")[ERROR].std().mean()
     return Finding(
-        title,
-        (
+        title=title,
+        sentences=(
             f"Of the {len(rank)} searches with an attack on each of these routes, "
             f"`{best}` has the largest geometric mean of the error in the surrogate, "
             f"{rank.max():.2f} m.",
@@ -300,13 +300,13 @@ def searches(drives: pd.DataFrame) -> Finding:
             "Between the starts of one attack, the error has a standard deviation of "
             f"{spread:.3f} m on average.",
         ),
-        ["search", *(f"{route}, surrogate (m)" for route in errors.columns)],
-        [
+        head=["search", *(f"{route}, surrogate (m)" for route in errors.columns)],
+        rows=[
             [str(name), *("–" if pd.isna(x) else f"{x:.3f}" for x in line)]
             for name, line in zip(errors.index, errors.to_numpy(), strict=True)
         ],
-        lambda figure: draw_searches(figure, errors),
-        _OF_SEARCHES,
+        draw=lambda figure: draw_searches(figure, errors),
+        pandas=_OF_SEARCHES,
     )
 
 
@@ -325,8 +325,8 @@ def flat(drives: pd.DataFrame) -> Finding:
     title = f"Flat objects send the car out of its lane in {percent} of the drives"
     kinds = summary(own, ["objects", "case"], ["cell"])
     return Finding(
-        title,
-        (
+        title=title,
+        sentences=(
             f"With the attack, {left[ATTACK]} of {count[ATTACK]} drives leave the lane "
             "in the path-traced scene, where its sun and sky light the object. "
             f"These drives are at {out} of {all_places} places (share: "
@@ -336,8 +336,13 @@ def flat(drives: pd.DataFrame) -> Finding:
             "The aim that we set before the first result is 60 % of the drives with "
             "the attack, and none with random textures.",
         ),
-        ["object", "texture", "mean error, `built_in` (m)", "drives out of the lane"],
-        [
+        head=[
+            "object",
+            "texture",
+            "mean error, `built_in` (m)",
+            "drives out of the lane",
+        ],
+        rows=[
             [
                 *(row["objects"], _CASES[row["case"]], f"{row[ERROR]:.3f}"),
                 f"{row['drives_departed']}/{row['drives']}",
@@ -345,10 +350,10 @@ def flat(drives: pd.DataFrame) -> Finding:
             for row in records(kinds)
             if row["case"] in _CASES
         ],
-        lambda figure: draw_shares(
+        draw=lambda figure: draw_shares(
             figure, shares, "share of drives that leave the lane"
         ),
-        'lit = drives[drives.environment == "built_in"]\n'
+        pandas='lit = drives[drives.environment == "built_in"]\n'
         'print(lit.groupby(["objects", "case"]).departed.mean())',
     )
 

@@ -54,9 +54,9 @@ def light(drives: pd.DataFrame) -> Finding:
         f"{of_method.get(name, 0)} attacks with `{name}`" for name in (VARY, PLAIN)
     )
     return Finding(
-        f"`vary` helps attacks in {helps} of {count} environments and lights, and "
-        f"reaches its aim in {met}",
-        (
+        title=f"`vary` helps attacks in {helps} of {count} environments and lights, "
+        f"and reaches its aim in {met}",
+        sentences=(
             "`vary` searches with light, camera and vehicle that differ from start to "
             "start. `plain` searches with those of the capture. The column '`vary` "
             "keeps' has the error with the attack in the environment, divided by the "
@@ -71,16 +71,16 @@ def light(drives: pd.DataFrame) -> Finding:
             if gains
             else "No place has an attack of both kinds, so the last column is empty.",
         ),
-        [
+        head=[
             *("environment", "condition", "`vary` keeps", "95 % interval", "aim"),
             *("`plain` keeps", "the same, no objects"),
             "error of `vary` to `plain`, 95 % interval",
         ],
-        rows,
-        lambda figure: draw_heat(figure, heat),
-        "own = drives.query(\"case == 'attack'\")\n"
+        rows=rows,
+        draw=lambda figure: draw_heat(figure, heat),
+        pandas="own = drives.query(\"case == 'attack'\")\n"
         'print(own.pivot_table("cross_track_mean_m", "environment", "condition"))',
-        (
+        threats=(
             "The aim is the least share that `vary` should keep. We set the aims "
             "before the first result.",
             "In `mujoco`, the car stands on wheels, and its steering lags.",

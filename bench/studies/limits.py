@@ -42,9 +42,9 @@ def limits(places: pd.DataFrame) -> Finding:
         for kind, own in rows.groupby("objects", sort=False)
     ]
     return Finding(
-        f"Objects can take the car off the lane at {rows['out'].sum():.0f} of "
+        title=f"Objects can take the car off the lane at {rows['out'].sum():.0f} of "
         f"{len(rows)} places",
-        (
+        sentences=(
             "The reach is the largest change of the control that the pixels of the "
             "objects can cause, in rad/s. If each pixel takes its worst value in each "
             f"frame, the car leaves the lane at {', and at '.join(counts)}.",
@@ -53,15 +53,15 @@ def limits(places: pd.DataFrame) -> Finding:
             "Over all places, the largest error with the original colours has a median "
             f"of {rows['original_m'].median():.2f} m.",
         ),
-        [
+        head=[
             *("objects", "route", "places off the lane", "pixels, median"),
             "reach, median (rad/s)",
             *("largest error, original, median (m)", "with the reach, median (m)"),
         ],
-        lines,
-        lambda figure: draw_shares(
+        rows=lines,
+        draw=lambda figure: draw_shares(
             figure, shares, "share of places where the reach takes the car off the lane"
         ),
-        'drives["route"] = drives.place.str.split("-").str[0]\n'
+        pandas='drives["route"] = drives.place.str.split("-").str[0]\n'
         'print(drives.groupby("route")[["moved", "up_m", "down_m"]].median())',
     )

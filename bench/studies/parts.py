@@ -41,9 +41,10 @@ def vary_parts(drives: pd.DataFrame) -> Finding:
     shares = [f"{x:.2f} with `{name}`" for name, x in means.items()]
     above = [f"`{name}` in {(gains[name] > 0).sum()}" for name in gains.columns]
     return Finding(
-        f"{len(places)} places do not show which part of `vary` helps: on average, "
-        f"`{best}` has the largest error, {means[best]:.2f} times that without a part",
-        (
+        title=f"{len(places)} places do not show which part of `vary` helps: on "
+        f"average, `{best}` has the largest error, {means[best]:.2f} times that "
+        f"without a part",
+        sentences=(
             f"The error in {len(logs)} environments and lights, divided by the error "
             "of an attack that varies nothing, is "
             f"{', '.join(shares[:-1])} and {shares[-1]} (geometric mean).",
@@ -52,9 +53,9 @@ def vary_parts(drives: pd.DataFrame) -> Finding:
             "each. These are too few for an interval, so the order of the parts is "
             "uncertain.",
         ),
-        ["environment", "condition", "nothing (m)", *gains.columns],
-        rows,
-        lambda figure: draw_searches(figure, errors.map(math.exp)),
-        "attacks = drives.query(\"case == 'attack'\").copy()\n"
+        head=["environment", "condition", "nothing (m)", *gains.columns],
+        rows=rows,
+        draw=lambda figure: draw_searches(figure, errors.map(math.exp)),
+        pandas="attacks = drives.query(\"case == 'attack'\").copy()\n"
         'print(attacks.groupby(["attack", "environment"]).cross_track_mean_m.mean())',
     )

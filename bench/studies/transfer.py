@@ -35,8 +35,8 @@ def transfer(drives: pd.DataFrame) -> Finding:
         f"environments, under half in {lost}"
     )
     return Finding(
-        title,
-        (
+        title=title,
+        sentences=(
             f"By day, the error with the attack is {by_day.max():.2f} times the error "
             f"in the surrogate in `{by_day.idxmax()}`, and {by_day.min():.2f} times in "
             f"`{by_day.idxmin()}`.",
@@ -46,18 +46,18 @@ def transfer(drives: pd.DataFrame) -> Finding:
             f"{drives['attack'].nunique()} attacks, and attacks at one place count as "
             "one value.",
         ),
-        [
+        head=[
             *("environment, by day", "error to the surrogate's", "95 % interval"),
             "the same without objects",
         ],
-        [
+        rows=[
             [str(n), f"{x:.2f}", ends_cell(ends.get(n), 2), f"{y:.2f}"]
             for (n, x), y in zip(by_day.items(), bare, strict=True)
         ],
-        lambda figure: draw_heat(figure, heat),
-        "own = drives.query(\"case == 'attack' and condition == 'day'\")\n"
+        draw=lambda figure: draw_heat(figure, heat),
+        pandas="own = drives.query(\"case == 'attack' and condition == 'day'\")\n"
         'print(own.pivot_table("cross_track_mean_m", "environment", "route"))',
-        (
+        threats=(
             "A grey cell of the chart means: no drive exists. "
             "[transfer](../../howto/transfer.md) explains the labels.",
         ),

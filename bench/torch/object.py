@@ -56,13 +56,13 @@ class ObjectData:
         columns = (pose.rotation, pose.translation, np.full(3, pose.scale))
         values = field.parameters()
         return ObjectData(
-            np.array(edges),
-            np.array([field.lower, field.upper]),
-            np.column_stack(columns),
-            values["density"].numpy().copy(),
-            values["texture"].numpy().copy(),
-            field.occupancy.cells.astype(np.uint8),
-            np.array([field.density_scale, field.step_m]),
+            levels=np.array(edges),
+            box=np.array([field.lower, field.upper]),
+            to_world=np.column_stack(columns),
+            density=values["density"].numpy().copy(),
+            texture=values["texture"].numpy().copy(),
+            cells=field.occupancy.cells.astype(np.uint8),
+            numbers=np.array([field.density_scale, field.step_m]),
         )
 
     def write(self, path: Path) -> None:
@@ -128,7 +128,15 @@ class TorchObject:
 
     def __init__(self, data: ObjectData, stop: float) -> None:
         levels, base, largest = map(int, data.levels)
-        sizes = level_sizes(NGPLayout(levels, 4, 24, base, largest))
+        sizes = level_sizes(
+            NGPLayout(
+                levels=levels,
+                features=4,
+                log2_table=24,
+                base_resolution=base,
+                max_resolution=largest,
+            )
+        )
         slots = np.array([size for _, _, size in sizes])
         self.scale = torch.tensor([scale for scale, _, _ in sizes])
         self.factors = torch.tensor(

@@ -104,7 +104,9 @@ def render_asset(
     integrator = mi.load_dict({"type": kind, "max_depth": 2, "hide_emitters": True})
     images = np.empty((n_views, size_px, size_px, 4), np.uint8)
     depth = np.empty((n_views, size_px, size_px), np.float32)
-    views = iterate_views(scene, camera, poses, spp, seed, integrator)
+    views = iterate_views(
+        scene, camera, poses, spp=spp, seed=seed, integrator=integrator
+    )
     for i, view in enumerate(views):
         images[i] = straight_rgba(view.rgb, view.alpha[..., None])
         depth[i] = view.depth if is_solid else _solid_depth(scene, camera, poses[i])

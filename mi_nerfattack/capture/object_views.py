@@ -130,7 +130,7 @@ def read_views(
             )
         return ObjectViews(images, *find_bounds(images, None, bounds), None)
     matrix = turn_matrix(placement.turn_deg) @ up_matrix(placement.up or "z")
-    images = move_views(images, matrix, 1.0, np.zeros(3))
+    images = move_views(images, matrix, scale=1.0, offset=np.zeros(3))
     lower, upper = silhouette_bounds(images)
     scale = extent_scale(
         str(folder), upper - lower, placement.height_m, placement.longest_m
@@ -139,4 +139,6 @@ def read_views(
     images = move_views(images, np.eye(3), scale, -scale * base)
     if (placement.height_m, placement.longest_m) != (None, None):
         images = replace(images, unit="metre")
-    return ObjectViews(images, scale * (lower - base), scale * (upper - base), None)
+    return ObjectViews(
+        images, scale * (lower - base), scale * (upper - base), depth=None
+    )

@@ -71,7 +71,7 @@ def read_poses(
     if suffix == ".json":
         return _read_json(path, image_shape)
     if suffix == ".csv":
-        return _from_rows(path, _csv_rows(path), mount, None)
+        return _from_rows(path, _csv_rows(path), mount, camera=None)
     if suffix == ".toml":
         table = files.read_toml(path)
         rows = table.get("frames")
@@ -100,12 +100,12 @@ def _read_json(path: Path, image_shape: tuple[int, ...] | None) -> PoseTable:
             )
         (camera,) = cameras
     return PoseTable(
-        path,
-        poses,
-        _times(path, frames),
-        _names(path, frames, "file_path"),
-        camera,
-        table.get("depth_file"),
+        where=path,
+        camera_to_world=poses,
+        times=_times(path, frames),
+        names=_names(path, frames, "file_path"),
+        camera=camera,
+        depth_file=table.get("depth_file"),
     )
 
 

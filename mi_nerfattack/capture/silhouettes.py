@@ -62,7 +62,9 @@ def silhouette_bounds(images: PosedImages) -> tuple[np.ndarray, np.ndarray]:
     lower, upper = find_bounds(replace(images, points=None))
     cells = _COARSE
     for _ in range(_PASSES):
-        inside = _inside(images, chosen, silhouettes, lower, upper, cells)
+        inside = _inside(
+            images, chosen, silhouettes, lower=lower, upper=upper, cells=cells
+        )
         if not inside.any():
             raise InputError(
                 "images: no point lies inside of all silhouettes; check the poses and "

@@ -123,15 +123,15 @@ def read_transforms(
     )
     names = tuple(str(frame["file_path"]) for frame in used.values())
     return PosedImages(
-        images,
-        poses,
-        reduced[0],
-        names,
-        tuple(missing),
-        differing(reduced),
-        _read_points(source, table, cameras, poses),
-        str(table.get("units", "unknown")),
-        masks,
+        images=images,
+        camera_to_world=poses,
+        camera=reduced[0],
+        names=names,
+        missing=tuple(missing),
+        cameras=differing(reduced),
+        points=_read_points(source, table, cameras, poses),
+        unit=str(table.get("units", "unknown")),
+        masks=masks,
     )
 
 

@@ -70,9 +70,9 @@ class _Asset(ABC):
                     views,
                     self.resolution,
                     options,
-                    partial(show_fit, bars),
-                    checkpoint,
-                    self.force,
+                    progress=partial(show_fit, bars),
+                    checkpoint=checkpoint,
+                    anew=self.force,
                 )
             provenance = {
                 "source": self._source(),

@@ -77,8 +77,15 @@ class Bake:
                 f"{plan.peak_mb:.0f} MB while they are baked"
             )
             started = time.perf_counter()
-            counter = bars.counter("baking", "pass ")
-            baked = bake(scene, routes, camera, mount, options, plan, counter)
+            baked = bake(
+                scene,
+                routes,
+                camera,
+                mount=mount,
+                options=options,
+                plan=plan,
+                progress=bars.counter("baking", "pass "),
+            )
             seconds = time.perf_counter() - started
             save_field(output, baked)
             posed = PosedField(baked, scene.pose)

@@ -115,12 +115,12 @@ class CaptureScene(_Capture):
             self.source,
             self.routes_file,
             self.output,
-            self.views,
-            camera,
-            self.spp,
-            self.seed,
-            bars.counter("rendering views"),
-            mount,
+            n=self.views,
+            camera=camera,
+            spp=self.spp,
+            seed=self.seed,
+            progress=bars.counter("rendering views"),
+            mount=mount,
         )
         show = bars.counter("drawing the place")
         show(0, 1)
@@ -191,12 +191,12 @@ class _Estimate(_Capture):
         from mi_nerfattack.capture.photographs.estimate import PoseOptions
 
         return PoseOptions(
-            self.matching,
-            self.lens,
-            self.long_edge,
-            self.metres_per_unit,
-            None if self.distance is None else Distance(*self.distance),
-            self._markers(),
+            matching=self.matching,
+            lens=self.lens,
+            long_edge_px=self.long_edge,
+            metres_per_unit=self.metres_per_unit,
+            distance=None if self.distance is None else Distance(*self.distance),
+            markers=self._markers(),
             masks=self.masks,
             seed=self.seed,
         )

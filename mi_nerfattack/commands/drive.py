@@ -223,7 +223,15 @@ def _drive(
     camera = devices.camera.camera
     log = DriveLog(path, camera, clock, time.time_ns(), metadata)
     say(f"Log        {path}")
-    loop = DriveLoop(devices, settings, log, rig.rounds, clock, rig.sleep, say)
+    loop = DriveLoop(
+        devices,
+        settings,
+        log,
+        rounds=rig.rounds,
+        clock=clock,
+        sleep=rig.sleep,
+        tell=say,
+    )
     with closing(log):
         try:
             if config.simulated:

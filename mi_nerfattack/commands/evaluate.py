@@ -167,7 +167,15 @@ class Evaluate:
             raise InputError(f"policy: the car of the place {reason}")
         check_policy(section.build(place.rig.views), place, routes)
         store = Store(self.drives)
-        return EvaluateDrives(store, section, place, under, routes, settings, vehicle)
+        return EvaluateDrives(
+            store=store,
+            policy=section,
+            place=place,
+            environments=under,
+            routes=routes,
+            settings=settings,
+            vehicle=vehicle,
+        )
 
     def _settings(self, place: Place, is_own: bool) -> EvaluateSettings:
         """Say how to drive at a place: the scenario's own, or one of the options."""

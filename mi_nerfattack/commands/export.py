@@ -142,7 +142,9 @@ class ExportPrint:
                 box.edges_mm(self.size_mm),
                 bars.counter("printing", "page "),
             )
-            count = write_net(path, box, edges, self.paper, self.dpi, counter)
+            count = write_net(
+                path, box, edges, paper=self.paper, dpi=self.dpi, on_page=counter
+            )
         size = " x ".join(f"{edge:.1f}" for edge in edges)
         pages = "page" if count == 1 else "pages"
         what = "net" if box.sheet is None else "sheet"

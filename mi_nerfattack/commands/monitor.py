@@ -105,7 +105,14 @@ class Monitor(ScreenOptions):
 
         with closing(tracker):
             server = FollowServer(
-                endpoint, page, standing, box, tracker, self.body, camera, say
+                endpoint,
+                page,
+                standing,
+                box=box,
+                tracker=tracker,
+                body=self.body,
+                camera=camera,
+                say=say,
             )
             with closing(server):
                 say(f"{server.address}: open it on the monitor, F for full screen")

@@ -144,7 +144,9 @@ class Retrain:
         with StageBars() as bars:
             setting = policy.setting(self.output)
             after = drives.drive(AFTER, workers, bars.counter, setting)
-            anew = self._adapt(drives, before, after, setting, workers, bars)
+            anew = self._adapt(
+                drives, before, after, policy=setting, workers=workers, bars=bars
+            )
         document = _describe(policy.content, groups, anew, others) | trained
         document["table"] = table_rows(before, after)
         files.write_json(comparison_path, document)

@@ -59,7 +59,12 @@ class ServePolicy:
             black = mi.TensorXf(np.zeros((1, *self.size[::-1], 3), np.float32))
             from mi_nerfattack.deploy.environment import trial_numbers
 
-            policy.step(black, 0, policy.initial_memory(1), trial_numbers(policy))
+            policy.step(
+                black,
+                goal=0,
+                memory=policy.initial_memory(1),
+                numbers=trial_numbers(policy),
+            )
         with closing(PolicyServer(endpoint, policy, token)) as server:
             asked = "asks for the token" if token else "on this computer alone"
             say(f"Serving at http://{endpoint}, {asked}; Ctrl-C ends")

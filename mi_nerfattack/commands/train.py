@@ -135,7 +135,12 @@ class Train:
         if output is None:
             with StageBars() as bars:
                 shards = collect_frames(
-                    sites, routes, settings, self.data, workers, bars.show
+                    sites,
+                    routes,
+                    settings,
+                    folder=self.data,
+                    workers=workers,
+                    progress=bars.show,
                 )
             counts = count_frames(self.data, shards)
             lines = [f"{self.data / name}: {n} frames" for name, n in counts.items()]
@@ -147,18 +152,17 @@ class Train:
                 sites,
                 routes,
                 settings,
-                self.data,
-                workers,
-                bars.show,
-                start,
-                earlier_shards,
+                folder=self.data,
+                workers=workers,
+                progress=bars.show,
+                start=start,
+                earlier_shards=earlier_shards,
             )
         command = command_line("train", self)
         record = training_record(settings, sites, self.data, result, command)
         document = write_trained(output, result.module, record)
         picture = output.with_name(f"{output.stem}-place.png")
-        title = f"{output.name}: where it was trained"
-        self._draw(picture, title, place, routes)
+        self._draw(picture, f"{output.name}: where it was trained", place, routes)
 
         def show() -> None:
             console().print(card_table(result.card))

@@ -174,12 +174,12 @@ def paint(
     radiance = _texel_colours(field, atlas, corners, normals)
     albedo = linear_to_uint8(np.pi / captured_irradiance * radiance)
     return BuiltInObject(
-        corners.reshape(-1, 3),
-        np.arange(3 * len(corners)).reshape(-1, 3),
-        atlas.uv.reshape(-1, 2),
-        atlas.image(albedo),
-        pose,
-        normals.reshape(-1, 3) if shell.is_smooth else None,
+        vertices=corners.reshape(-1, 3),
+        faces=np.arange(3 * len(corners)).reshape(-1, 3),
+        uv=atlas.uv.reshape(-1, 2),
+        image=atlas.image(albedo),
+        pose=pose,
+        normals=normals.reshape(-1, 3) if shell.is_smooth else None,
     )
 
 

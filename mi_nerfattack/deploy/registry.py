@@ -133,10 +133,10 @@ def _replay(place: Place, conditions: Conditions) -> AbstractEnvironment:
     return ReplayEnvironment(
         recording,
         place.mount,
-        place.period,
-        car.max_control,
-        car.control_unit,
-        car.more_controls,
+        period=place.period,
+        max_control=car.max_control,
+        control_unit=car.control_unit,
+        more_controls=car.more_controls,
     )
 
 

@@ -89,11 +89,11 @@ class AbstractSimulation(AbstractEnvironment):
         exposure, blur = np.zeros((1, 3)), np.full(1, self.blur_px)
         observation = disturbed(
             image,
-            exposure,
-            blur,
-            self.noise_sd,
-            self._seed,
-            self._steps,
+            exposures=exposure,
+            blurs=blur,
+            noise_sd=self.noise_sd,
+            seed=self._seed,
+            step=self._steps,
             layout=self.rig.layout,
         )
         image = np.round(255 * np.array(observation)[0]).astype(np.uint8)

@@ -37,7 +37,13 @@ from mi_nerfattack.vehicle.expert import AbstractExpert
 from mi_nerfattack.vehicle.route.route import Route
 
 #: Of the starts: 0.25 m and 3 degrees, cut at three times as much.
-STARTS = Scatter(0.25, 0.75, np.deg2rad(3.0).item(), np.deg2rad(9.0).item(), 0.0)
+STARTS = Scatter(
+    lateral_sd_m=0.25,
+    lateral_max_m=0.75,
+    heading_sd=np.deg2rad(3.0).item(),
+    heading_max=np.deg2rad(9.0).item(),
+    close_share=0.0,
+)
 
 
 @dataclass(frozen=True)
@@ -130,7 +136,7 @@ def drawn_start(
     settings: EvaluateSettings, route: Route, run: int
 ) -> tuple[np.ndarray, int]:
     """Return the pose (3,) from which a drive starts, and its seed."""
-    rng = _generator(settings, route, run, 0)
+    rng = _generator(settings, route, run, objects=0)
     return random_start(route, settings, rng), int(rng.integers(2**31))
 
 
@@ -164,13 +170,27 @@ def evaluate_run(
     count = 0 if case == EXPERT else settings.counts[case]
     with own_textures(objects if count else ()):
         posed = place_objects(
-            environment.period, route, count, run, objects, surroundings, settings
+            environment.period,
+            route,
+            count,
+            run=run,
+            objects=objects,
+            surroundings=surroundings,
+            settings=settings,
         )
         environment.show(posed)
         try:
             with one_thread():
                 return drive(
-                    environment, policy, route, pose, seed, steps, on_step, case, run
+                    environment,
+                    policy,
+                    route,
+                    pose=pose,
+                    seed=seed,
+                    steps=steps,
+                    on_step=on_step,
+                    case=case,
+                    run=run,
                 )
         finally:
             environment.show([])
@@ -352,7 +372,9 @@ def place_objects(
     horizon = max(settings.horizon, math.ceil(rule.view_s / period))
     steps = replace(settings, horizon=horizon).steps(route, period)
     stretch = 0.0, (steps - 1) * route.speed_ms * period
-    poses = rule.draw(fields, surroundings, route, stretch, rng, kinds)
+    poses = rule.draw(
+        fields, surroundings, route, stretch=stretch, rng=rng, kinds=kinds
+    )
     return [PosedField(item, pose) for item, pose in zip(fields, poses, strict=True)]
 
 

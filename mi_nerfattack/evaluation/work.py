@@ -210,12 +210,12 @@ class EvaluateDriver(AbstractDriver):
             environment,
             driver,
             route,
-            spec.case,
-            spec.run,
-            self._work.first(self._objects, settings.counts.get(spec.case, 0)),
-            self._surroundings,
-            settings,
-            on_step,
+            case=spec.case,
+            run=spec.run,
+            objects=self._work.first(self._objects, settings.counts.get(spec.case, 0)),
+            surroundings=self._surroundings,
+            settings=settings,
+            on_step=on_step,
         )
 
     def _make(self, under: EnvironmentUnder, blind: bool) -> AbstractEnvironment:

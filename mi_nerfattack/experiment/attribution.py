@@ -160,12 +160,12 @@ def attribute(
     states = drive.states_numpy()[:, 1:]
     error = [route.cross_track_numpy(vehicle) for vehicle in states]
     times = TimeAttribution(
-        drive.dt * np.arange(1, drive.horizon + 1),
-        total.costates,
-        by_period.attribution.along,
-        np.stack(error, axis=1),
-        limit_m,
-        list(objects),
+        time_s=drive.dt * np.arange(1, drive.horizon + 1),
+        costates=total.costates,
+        along=by_period.attribution.along,
+        cross_track_m=np.stack(error, axis=1),
+        limit_m=limit_m,
+        objects=list(objects),
     )
     subject = "gradient" if attack.freedom.texture_rate is not None else UNCHANGED
     return FailureAttribution(times, by_period.attribution.norms, textures, subject)

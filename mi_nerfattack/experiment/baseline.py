@@ -202,7 +202,14 @@ class Baseline:
         count = section.textures or equal
         deployed = min(count, section.deployment_textures)
         looks = RandomAppearances.of(world, original)
-        return cls(attack, looks, count, equal, deployed, multiple)
+        return cls(
+            attack,
+            looks,
+            count,
+            equal=equal,
+            deployed=deployed,
+            backward_multiple=multiple,
+        )
 
     def judge(
         self,

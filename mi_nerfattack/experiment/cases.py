@@ -126,13 +126,13 @@ class CaseDriver(AbstractDriver):
                 self.environment.get(key, lambda: world.open(label, empty)),
                 world.policy,
                 world.route,
-                shown.start,
-                spec.seed,
-                spec.steps,
-                on_step,
-                spec.case,
-                spec.run,
-                label,
+                pose=shown.start,
+                seed=spec.seed,
+                steps=spec.steps,
+                on_step=on_step,
+                case=spec.case,
+                run=spec.run,
+                label=label,
             )
 
 

@@ -166,10 +166,10 @@ class Job:
             world,
             drives,
             attack,
-            cases.looks,
-            folder.checkpoint.ignored,
-            baseline.figures(),
-            flags,
+            looks=cases.looks,
+            ignored=folder.checkpoint.ignored,
+            baseline=baseline.figures(),
+            flags=flags,
         )
         return results.write_results(
             self.output, done, effort, self.on_progress, self.on_notice, self.frames

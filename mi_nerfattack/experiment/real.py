@@ -223,15 +223,15 @@ def read_real(
     way = float(np.hypot(*np.diff(states[:, :2], axis=0).T).sum())
     errors = course.route.cross_track_numpy(states)
     drive = Drive(
-        REAL,
-        course.route.name,
-        case,
-        run,
-        run,
-        states,
-        course.controls(states, times),
-        errors[1:],
-        times[1:] - times[0],
+        environment=REAL,
+        route=course.route.name,
+        case=case,
+        run=run,
+        seed=run,
+        states=states,
+        controls=course.controls(states, times),
+        cross_track_m=errors[1:],
+        time_s=times[1:] - times[0],
     )
     is_out = bool(abs(errors[-1]) > course.lane.centre_m)
     covered, driven = covered / course.length_m, way / course.length_m

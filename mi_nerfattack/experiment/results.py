@@ -162,7 +162,7 @@ def _describe(done: Finished, effort: Callable[[], Effort]) -> dict[str, Any]:
     sections |= texture_figures(world, done.drives, done.look(OWN), done.look(ATTACK))
     values, cost = scenario.model_dump(mode="json"), effort().model_dump()
     document = metrics_document(
-        values, scenario.seed, done.driven, lanes, cost, done.costs
+        values, scenario.seed, done.driven, lanes=lanes, cost=cost, costs=done.costs
     )
     document |= sections
     attack, names = done.attack, [item.id for item in scenario.objects]

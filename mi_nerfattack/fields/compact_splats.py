@@ -62,10 +62,10 @@ def _read_splat(path: str | Path) -> Splats:
     return make_splats(
         path,
         centers,
-        np.log(scales),
-        (rows["turn"] - 128.0) / 128,
-        rows["rgba"][:, 3] / 255,
-        colours,
+        logarithms=np.log(scales),
+        quaternions=(rows["turn"] - 128.0) / 128,
+        opacities=rows["rgba"][:, 3] / 255,
+        harmonics=colours,
     )
 
 
@@ -107,10 +107,10 @@ def _read_spz(path: str | Path) -> Splats:
     return make_splats(
         path,
         _fixed(at.reshape(count, 3, 3)) / 2.0**bits * _TURN,
-        scales / 16 - 10.0,
-        quaternions,
-        alphas[:, 0] / 255,
-        harmonics,
+        logarithms=scales / 16 - 10.0,
+        quaternions=quaternions,
+        opacities=alphas[:, 0] / 255,
+        harmonics=harmonics,
     )
 
 

@@ -158,14 +158,14 @@ def _bricks(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> Brick
     return BrickField(
         _vector(meta, "lower"),
         _vector(meta, "upper"),
-        Occupancy(cells, octants),
-        subdivisions,
-        vertices,
-        Codes(*codes),
-        sky,
-        _number(meta, "step_m", float),
-        _number(meta, "cone", float),
-        _info(meta),
+        occupancy=Occupancy(cells, octants),
+        subdivisions=subdivisions,
+        vertices=vertices,
+        codes=Codes(*codes),
+        sky=sky,
+        step_m=_number(meta, "step_m", float),
+        cone=_number(meta, "cone", float),
+        info=_info(meta),
     )
 
 

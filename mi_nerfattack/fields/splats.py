@@ -253,7 +253,14 @@ def _decode(path: str | Path, rows: np.ndarray) -> Splats:
         opacities, scales = opacities * np.prod(sizes / wide, axis=1), np.log(wide)
     centers = _columns(path, rows, _CENTERS)
     quaternions = _columns(path, rows, _ROTATIONS)
-    return make_splats(path, centers, scales, quaternions, opacities, harmonics)
+    return make_splats(
+        path,
+        centers,
+        logarithms=scales,
+        quaternions=quaternions,
+        opacities=opacities,
+        harmonics=harmonics,
+    )
 
 
 def make_splats(
@@ -289,12 +296,12 @@ def make_splats(
         raise InputError(f"{path}: a position is not finite; export it again")
     require_near(path, centers)
     return Splats(
-        str(path),
-        centers.astype(np.float32),
-        np.exp(logarithms).astype(np.float32),
-        (quaternions / lengths).astype(np.float32),
-        opacities.astype(np.float32),
-        harmonics.astype(np.float32),
+        source=str(path),
+        centers=centers.astype(np.float32),
+        scales=np.exp(logarithms).astype(np.float32),
+        quaternions=(quaternions / lengths).astype(np.float32),
+        opacities=opacities.astype(np.float32),
+        harmonics=harmonics.astype(np.float32),
     )
 
 

@@ -148,7 +148,7 @@ class BatchSource:
         share = dr.select(used, dr.rcp(mi.Float(dr.maximum(rays, 1))), 0)
         gain = self.bank.corrections.gain(batch.image)
         loss, square, cotangent = loss_and_cotangent(
-            primal, behind, batch, self.weights, share, gain
+            primal, behind, batch, weights=self.weights, share=share, gain=gain
         )
         loss, square = dr.select(used, loss, 0), dr.select(used, square, 0)
         score = Score(dr.sum(loss), dr.sum(square), rays)

@@ -165,12 +165,12 @@ def fit_object(
         views.images,
         views.lower - room,
         views.upper + room,
-        GridLayout(16, 16, resolution),
-        options,
-        views.depth,
-        progress,
-        checkpoint,
-        anew,
+        layout=GridLayout(16, 16, resolution),
+        options=options,
+        depth=views.depth,
+        progress=progress,
+        checkpoint=checkpoint,
+        anew=anew,
     )
     for name in ("lower", "upper"):
         corner = " ".join(map(repr, getattr(views, name).tolist()))
@@ -208,15 +208,15 @@ def _run(
     )
     poses = training.images.camera_to_world[training.fitted]
     return FitResult(
-        training.field,
-        float(np.mean([score.psnr_db for score in scores])),
-        float(np.mean([score.ssim for score in scores])),
-        tuple(scores),
-        tuple(clock.history),
-        clock.elapsed,
-        training.step,
-        training.cameras.gains(),
-        training.cameras.poses(poses),
+        field=training.field,
+        psnr_heldout_db=float(np.mean([score.psnr_db for score in scores])),
+        ssim_heldout=float(np.mean([score.ssim for score in scores])),
+        per_view=tuple(scores),
+        history=tuple(clock.history),
+        wall_s=clock.elapsed,
+        steps=training.step,
+        exposure=training.cameras.gains(),
+        poses=training.cameras.poses(poses),
     )
 
 
@@ -274,15 +274,15 @@ class _Clock:
         self._reported = self.training.step
         square = float(total.square[0]) / rays
         at = FitProgress(
-            self.training.step,
-            self.options.steps,
-            self.fraction(),
-            float(total.loss[0]) / rays,
-            -10 * float(np.log10(max(square, 1e-12))),
-            self.elapsed,
-            self.training.field.occupancy.fraction,
-            rays / steps,
-            int(total.visible[0]) / steps,
+            step=self.training.step,
+            steps=self.options.steps,
+            fraction=self.fraction(),
+            loss=float(total.loss[0]) / rays,
+            psnr_db=-10 * float(np.log10(max(square, 1e-12))),
+            elapsed_s=self.elapsed,
+            occupied=self.training.field.occupancy.fraction,
+            rays=rays / steps,
+            samples=int(total.visible[0]) / steps,
         )
         self.history.append(at)
         self._is_stuck = self._stands_still()

@@ -156,7 +156,9 @@ def seen_cells(
         eye = images.camera_to_world[index, :3, 3].astype(np.float32)
         before = np.nonzero(((points - eye) ** 2).sum(1) < (_CLEAR * near) ** 2)[0]
         back = _BACK * near
-        open_to = _in_view(images, int(index), points[before], 0.0, 0.0, back)
+        open_to = _in_view(
+            images, int(index), points[before], radius=0.0, border=0.0, back=back
+        )
         clear[before[open_to]] = False
     cells = (clear & (count >= min(cameras, len(indices)))).reshape(coarse)
     for axis in range(3):

@@ -203,7 +203,7 @@ class TorchPolicy(AbstractPolicy):
     ) -> tuple[Any, Memory, Any]:
         """Evaluate the module again and its reverse derivative, one graph at a time."""
         _, (d_image, *gradients) = self._pull_back(
-            image, goal, memory, cotangent, d_memory, numbers
+            image, goal, memory, cotangent=cotangent, d_memory=d_memory, numbers=numbers
         )
         d_image = to_tensor(d_image, image)
         if numbers is None:

@@ -273,5 +273,9 @@ def _solid(faces: CubeFaces, key: str) -> np.ndarray:
     """
     image = faces.images[key]
     hazy = image[..., 3] < 128
-    nearest = np.asarray(distance_transform_edt(hazy, None, False, True))
+    nearest = np.asarray(
+        distance_transform_edt(
+            hazy, sampling=None, return_distances=False, return_indices=True
+        )
+    )
     return np.ascontiguousarray(image[nearest[0], nearest[1], :3])

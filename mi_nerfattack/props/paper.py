@@ -168,7 +168,7 @@ def pages(
     if len(sheets.tiles) > 1:
         yield _overview(box, net, sheets, description)
     for tile in sheets.tiles:
-        yield _page(box, net, sheets, tile, dpi, description)
+        yield _page(box, net, sheets, tile=tile, dpi=dpi, description=description)
 
 
 def _page(

@@ -286,7 +286,9 @@ def simulated_camera(
     def pose() -> TrackedPose:
         return room.pose_before(FRAME_LATENCY_S, _STEP_S)
 
-    return RenderedCamera(view, place.mount, pose, room.clock, place.period, seed)
+    return RenderedCamera(
+        view, place.mount, pose, clock=room.clock, period_s=place.period, seed=seed
+    )
 
 
 @contextmanager

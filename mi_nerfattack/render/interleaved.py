@@ -117,7 +117,14 @@ class InterleavedComposite(AbstractComposite):
         mode, rays, fields = dr.ADMode.Backward, task.rays, _fields(posed)
         if len(posed) == 1:
             (item,) = rays.light(posed)
-            march_derivative(mode, item, rays, task.primal, task.cotangent, stop)
+            march_derivative(
+                mode,
+                item,
+                rays,
+                primal=task.primal,
+                cotangent=task.cotangent,
+                stop=stop,
+            )
             return
         with dr.suspend_grad(), private_gradients():
             _replay(mode, fields, rays, task.primal, task.cotangent, stop, False)

@@ -89,7 +89,9 @@ def march(
     with dr.suspend_grad():
         heading = dr.normalize(posed.turn(rays.direction))
         walk, active = Walk.start(posed, rays, clear)
-        sums = integrate([posed], walk, active, [posed.eval], [heading], stop)
+        sums = integrate(
+            [posed], walk, active, evaluate=[posed.eval], towards=[heading], stop=stop
+        )
         return sums.march()
 
 

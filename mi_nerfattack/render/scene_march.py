@@ -57,7 +57,9 @@ def _walk_through(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
     nearest = mi.Float(dr.inf)
     searching = mi.Bool(active)
     while searching:
-        si = scene.ray_intersect(part, mi.RayFlags.All, False, searching)
+        si = scene.ray_intersect(
+            part, mi.RayFlags.All, coherent=False, active=searching
+        )
         met = searching & si.is_valid()
         passed = dr.max(si.bsdf().eval_null_transmission(si, met)) > 0
         nearest = dr.select(met & ~passed, behind + si.t, nearest)
@@ -184,10 +186,10 @@ def _opaque(rays: Rays) -> Rays:
     rays = Rays(
         mi.Point3f(dr.detach(rays.origin)),
         mi.Vector3f(dr.detach(rays.direction)),
-        mi.Float(dr.detach(rays.t_max)),
-        mi.Float(dr.detach(rays.jitter)),
-        mi.Bool(rays.active),
-        [Gain(mi.Color3f(dr.detach(x.colour)), x.row) for x in rays.gains],
+        t_max=mi.Float(dr.detach(rays.t_max)),
+        jitter=mi.Float(dr.detach(rays.jitter)),
+        active=mi.Bool(rays.active),
+        gains=[Gain(mi.Color3f(dr.detach(x.colour)), x.row) for x in rays.gains],
     )
     dr.make_opaque(rays)
     return rays

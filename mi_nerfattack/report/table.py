@@ -305,7 +305,9 @@ def sweep_table(document: Document) -> Table:
         f"out, and attacks with one out for {document['departed_s']:g} s in the mean "
         "over their drives, with Wilson's intervals."
     )
-    return Table(_MEAN, [*_PLACE, _CASE], figures, groups, 3, caption)
+    return Table(
+        _MEAN, [*_PLACE, _CASE], figures, records=groups, heading=3, caption=caption
+    )
 
 
 def comparisons_table(document: Document) -> Table:

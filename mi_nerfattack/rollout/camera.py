@@ -232,7 +232,14 @@ class SceneCamera:
         height, pitch = self._mount(dr.width(pose))
         mount = self.mount
         ahead, left, yaw = mount.forward_m, mount.left_m, mount.yaw_deg
-        placement = mount_pose(state, height, ahead, pitch, left, yaw)
+        placement = mount_pose(
+            state,
+            height_m=height,
+            forward_m=ahead,
+            pitch_deg=pitch,
+            left_m=left,
+            yaw_deg=yaw,
+        )
         dr.eval(placement)
         return placement
 

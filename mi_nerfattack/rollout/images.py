@@ -58,8 +58,12 @@ class SceneImages:
         # From the state to rays, to their radiance, and to linear pixels
         with dr.suspend_grad():
             sampler, *view = camera.rays(pose_of(state), count, step)
-            linear, state_out = self._render(camera, sampler, view, None, gains)
-        return _observation(camera, linear, state_out, view, count, step)
+            linear, state_out = self._render(
+                camera, sampler, view, state_in=None, gains=gains
+            )
+        return _observation(
+            camera, linear, state_out, view=view, count=count, step=step
+        )
 
     def keep(self, observation: Observation) -> Any:
         """Keep what the integrator has to, or else the pixels and its whole state."""
@@ -86,7 +90,7 @@ class SceneImages:
                 dr.eval(view)
                 inner = self.collector.restore(view[0], record, gains)
                 linear, inner = self._render(camera, sampler, view, inner)
-        return _observation(camera, linear, inner, view, count, step)
+        return _observation(camera, linear, inner, view=view, count=count, step=step)
 
     def vjp(
         self,
@@ -113,7 +117,14 @@ class SceneImages:
             with dr.isolate_grad():
                 sampler = camera.sampler(count, step)
                 state_in = observation.integrator_state
-                self._sample(camera, dr.ADMode.Backward, sampler, ray, δL, state_in)
+                self._sample(
+                    camera,
+                    dr.ADMode.Backward,
+                    sampler,
+                    ray=ray,
+                    δL=δL,
+                    state_in=state_in,
+                )
         if leaf is None:
             return None
         result = dr.grad(leaf)
@@ -141,7 +152,7 @@ class SceneImages:
         ray, weight = view
         mode = dr.ADMode.Primal
         colour, _, _, state_out = self._sample(
-            camera, mode, sampler, ray, None, state_in, gains
+            camera, mode, sampler, ray=ray, δL=None, state_in=state_in, gains=gains
         )
         linear = camera.pixels(colour * weight)
         dr.eval(linear, state_out)

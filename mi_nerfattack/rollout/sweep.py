@@ -214,9 +214,9 @@ class Sweep:
             _batch(images),
             loop.goal,
             last.memory,
-            _batch(cotangents),
-            self.d_memory,
-            numbers[-1],
+            cotangent=_batch(cotangents),
+            d_memory=self.d_memory,
+            numbers=numbers[-1],
         )
         release_heap()  # or memory grows with the horizon
         if d_numbers is not None:
@@ -243,7 +243,9 @@ class Sweep:
         d_still, self._d_still = self._d_still, None
         if d_still is not None and self.drive.still is not None:
             state, _ = self.drive.camera(0)
-            differentiable(self.loop).vjp(self.drive.still, state, d_still, False)
+            differentiable(self.loop).vjp(
+                self.drive.still, state, d_image=d_still, attached=False
+            )
 
 
 def backward(

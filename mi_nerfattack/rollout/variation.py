@@ -101,13 +101,13 @@ class Variation:
         )
         light = self.light_ev_sd * normal[0] + self.light_colour_ev_sd * normal[1:4]
         return Draws(
-            2.0**light,
-            self.pitch_deg_sd * normal[4],
-            np.exp(self.height_sd * normal[5]),
-            np.exp(self.speed_sd * normal[6]),
-            np.exp(self.steering_sd * normal[7]),
-            self.steering_lag_s_sd * lags[first:],
-            self.delay_s_sd * delays[first:],
+            light=2.0**light,
+            pitch_deg=self.pitch_deg_sd * normal[4],
+            height=np.exp(self.height_sd * normal[5]),
+            speed=np.exp(self.speed_sd * normal[6]),
+            steering=np.exp(self.steering_sd * normal[7]),
+            lag_s=self.steering_lag_s_sd * lags[first:],
+            delay_s=self.delay_s_sd * delays[first:],
         )
 
     def suns(self, first: int, count: int) -> list[Sunlight]:

@@ -301,13 +301,13 @@ class AbstractTextureFreedom(Section):
 
     def _constraints(self) -> Constraints:
         return Constraints(
-            self.linf,
-            self.l2,
-            self.lowest,
-            self.highest,
-            Gamut.load(self.gamut.file) if self.gamut else None,
-            self.fixed_m,
-            self.total_variation,
+            linf=self.linf,
+            l2=self.l2,
+            lowest=self.lowest,
+            highest=self.highest,
+            gamut=Gamut.load(self.gamut.file) if self.gamut else None,
+            fixed=self.fixed_m,
+            total_variation=self.total_variation,
         )
 
     def _colouring(self) -> Callable[[GridField], Colours]:

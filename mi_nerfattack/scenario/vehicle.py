@@ -241,7 +241,7 @@ class AbstractSingleTrackSection(AbstractVehicleSection):
 
     def _accelerated(self, wheelbase: float) -> dict[str, Any]:
         most, brake = self.max_acceleration_ms2, self.max_brake_ms2
-        controls = (Control("acceleration", "m/s^2", -brake, most),)
+        controls = (Control("acceleration", "m/s^2", lowest=-brake, highest=most),)
         return _steered(wheelbase, self.max_steer_deg) | {"more_controls": controls}
 
 

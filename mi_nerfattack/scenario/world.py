@@ -99,14 +99,14 @@ class World:
         """Close the loop through a sensor."""
         motion = self.motion
         return ClosedLoop(
-            sensor,
-            self.policy,
-            self.route.goal,
-            motion.dynamics,
-            motion.integrator,
-            self.scenario.vehicle.dt_s,
-            motion.substeps,
-            motion.delay,
+            sensor=sensor,
+            policy=self.policy,
+            goal=self.route.goal,
+            dynamics=motion.dynamics,
+            integrator=motion.integrator,
+            dt=self.scenario.vehicle.dt_s,
+            substeps=motion.substeps,
+            delay=motion.delay,
             route=self.route,
         )
 
@@ -191,17 +191,17 @@ def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
     objective = scenario.objective.build(scenario, route, motion.dynamics)
     where = place_of(scenario, surrogate.rig, motion)
     return World(
-        scenario,
-        route,
-        surrogate.fields,
-        surrogate,
-        optimised,
-        where,
-        deployments(scenario.deployment, where),
-        policy,
-        motion,
-        objective,
-        initial_states(scenario, route, scenario.drive.runs, 0),
+        scenario=scenario,
+        route=route,
+        fields=surrogate.fields,
+        surrogate=surrogate,
+        optimised=optimised,
+        place=where,
+        deployments=deployments(scenario.deployment, where),
+        policy=policy,
+        motion=motion,
+        objective=objective,
+        initial=initial_states(scenario, route, scenario.drive.runs, stream=0),
     )
 
 
@@ -315,12 +315,12 @@ def build_rollout(world: World) -> tuple[Rollout, Any]:
     if section.vary != VarySection():
         loop = section.vary.applied(loop, scenario.seed)
     rollout = Rollout(
-        loop,
-        world.objective,
-        world.horizon,
-        scenario.objective.reduction,
-        section.adjoint,
-        section.attached,
+        loop=loop,
+        objective=world.objective,
+        horizon=world.horizon,
+        reduction=scenario.objective.reduction,
+        adjoint=section.adjoint,
+        attached=section.attached,
     )
     return rollout, loop.initial(optimised_states(scenario, world.route))
 
@@ -366,7 +366,7 @@ def _load_layer(scenario: Scenario, path: Path) -> Layer:
 
 def optimised_states(scenario: Scenario, route: Route) -> np.ndarray:
     """Return the states (m, 3) that an attack starts from, the nominal one first."""
-    states = initial_states(scenario, route, scenario.attack.poses, 2)
+    states = initial_states(scenario, route, scenario.attack.poses, stream=2)
     states[0] = route.pose_at(scenario.drive.start_m)
     return states
 

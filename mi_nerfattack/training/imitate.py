@@ -185,13 +185,13 @@ class _Imitation:
         site, settings = self.sites[0], self.settings
         object_count = max(settings.validation.most, settings.final.most)
         self._loop = ClosedLoop(
-            [site.open(site.typical()) for site in self._validated()],
-            self.routes,
-            site.load_objects(object_count),
-            site.load_surroundings() if object_count else None,
-            self.settings.validation,
-            self.settings.validate_every,
-            self._shown("validation"),
+            environments=[site.open(site.typical()) for site in self._validated()],
+            routes=self.routes,
+            objects=site.load_objects(object_count),
+            surroundings=site.load_surroundings() if object_count else None,
+            settings=self.settings.validation,
+            every=self.settings.validate_every,
+            progress=self._shown("validation"),
         )
         return self
 
@@ -212,7 +212,7 @@ class _Imitation:
     def collect_first(self) -> tuple[list[Path], list[Path]]:
         """Collect the frames of the first training, and the held-out ones, if any."""
         settings, source = self.settings, self.settings.cloning
-        first = self.collect("round_0", settings.frames, source, 0)
+        first = self.collect("round_0", settings.frames, source, number=0)
         frames = settings.validation_frames
         return first, self.collect("held_out", frames, source, _HELD_OUT)
 

@@ -84,7 +84,13 @@ PRESETS: Mapping[str, Preset] = {
 EVALUATIONS: Mapping[str, EvaluateSettings] = {
     "intersection": EvaluateSettings(),
     "room": EvaluateSettings(
-        scatter=Scatter(0.03, 0.09, np.deg2rad(3.0).item(), np.deg2rad(9.0).item(), 0),
+        scatter=Scatter(
+            lateral_sd_m=0.03,
+            lateral_max_m=0.09,
+            heading_sd=np.deg2rad(3.0).item(),
+            heading_max=np.deg2rad(9.0).item(),
+            close_share=0,
+        ),
         car_width_m=SMALL_CAR.width,
         roadside=_ROOM_ROADSIDE,
     ),

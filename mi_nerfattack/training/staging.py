@@ -115,7 +115,7 @@ class _RandomStage(AbstractStage):
         fields = [self._fields[index] for index in chosen]
         stretch = _in_view(route, arc, settings)
         poses = settings.roadside.find(
-            fields, self._surroundings, route, stretch, rng, chosen
+            fields, self._surroundings, route, stretch=stretch, rng=rng, kinds=chosen
         )
         pairs = zip(fields, poses, strict=True)
         return [PosedField(item, pose) for item, pose in pairs if pose is not None]

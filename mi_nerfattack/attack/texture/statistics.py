@@ -69,7 +69,7 @@ def seen_weights(
             # The derivative of the sum of all pixel values, summed over the states
             observation = sensor.observe(state, step)
             ones = dr.ones(mi.TensorXf, observation.image.shape)
-            sensor.vjp(observation, state, ones, False)
+            sensor.vjp(observation, state, ones, attached=False)
         gradients = sensor.texture_gradients()
     finally:
         sensor.stop_gradient()
@@ -93,7 +93,9 @@ def texture_statistics(
     texture = field.texture
     visible = weights > _LEAST_WEIGHT * weights.max(initial=0.0)
     if not visible.any():
-        return TextureStatistics(0.0, 0.0, 0.0, 0.0, [])
+        return TextureStatistics(
+            l2=0.0, linf=0.0, saturated_share=0.0, total_variation=0.0, spectrum=[]
+        )
     # The colours of both textures, at the vertices that the images show
     colour = vertex_colours(field, field.levels()[-1], visible)
     try:

@@ -94,14 +94,14 @@ def read_colmap(
     require_near(where, poses[:, :3, 3])
     images, reduced = load_images(paths, lenses, source, long_edge_px)
     return PosedImages(
-        images,
-        poses,
-        reduced[0],
-        tuple(record.name for record in used),
-        missing,
-        differing(reduced),
-        points,
-        "arbitrary",
+        images=images,
+        camera_to_world=poses,
+        camera=reduced[0],
+        names=tuple(record.name for record in used),
+        missing=missing,
+        cameras=differing(reduced),
+        points=points,
+        unit="arbitrary",
     )
 
 

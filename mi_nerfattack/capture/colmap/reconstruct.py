@@ -122,12 +122,12 @@ def _structure(structure: dict[str, Any] | None, count: int) -> Structure:
             "one (--lens SIMPLE_RADIAL) or more photographs"
         ) from error
     return Structure(
-        tuple(structure["names"]),
-        poses,
-        tuple(known[i] for i in structure["camera_ids"]),
-        np.array(structure["points"], np.float64).reshape(-1, 3),
-        structure["error_px"],
-        tuple(structure["points_seen"]),
-        tuple(structure["errors_px"]),
-        structure["features"],
+        names=tuple(structure["names"]),
+        camera_to_world=poses,
+        cameras=tuple(known[i] for i in structure["camera_ids"]),
+        points=np.array(structure["points"], np.float64).reshape(-1, 3),
+        error_px=structure["error_px"],
+        points_seen=tuple(structure["points_seen"]),
+        errors_px=tuple(structure["errors_px"]),
+        features=structure["features"],
     )

@@ -151,12 +151,12 @@ def estimate_poses(
             staged,
             list(groups.values()),
             work,
-            options.matching,
-            options.lens,
-            options.long_edge_px,
-            options.seed,
-            progress,
-            None if options.masks is None else masks,
+            matching=options.matching,
+            lens=options.lens,
+            long_edge_px=options.long_edge_px,
+            seed=options.seed,
+            progress=progress,
+            masks=None if options.masks is None else masks,
         )
         scale_source = options.markers or options.tracked
         scale_source = scale_source or options.distance or options.metres_per_unit
@@ -204,14 +204,14 @@ def _write(
     apart = np.linalg.norm(eyes[:, None] - eyes[None], axis=2)
     a, b = np.unravel_index(int(apart.argmax()), apart.shape)
     return PoseEstimate(
-        path,
-        structure.names,
-        left_out,
-        structure.cameras,
-        structure.error_px,
-        (structure.names[a], structure.names[b]),
-        float(apart[a, b]),
-        scale,
-        structure,
-        qualities,
+        path=path,
+        placed=structure.names,
+        left_out=left_out,
+        cameras=structure.cameras,
+        error_px=structure.error_px,
+        farthest=(structure.names[a], structure.names[b]),
+        distance=float(apart[a, b]),
+        scale=scale,
+        structure=structure,
+        qualities=qualities,
     )

@@ -96,7 +96,15 @@ def assess(
         relative = float(sharpness[i]) / median if median > 0 else 1.0
         features = structure.features.get(name, 0)
         result.append(
-            Quality(name, name in measures, features, points, error, relative, gap)
+            Quality(
+                name=name,
+                placed=name in measures,
+                features=features,
+                points=points,
+                error_px=error,
+                sharpness=relative,
+                gap_deg=gap,
+            )
         )
     return tuple(result)
 

@@ -165,12 +165,12 @@ def _held(exif: Image.Exif, width: int, height: int) -> HeldCamera:
 
     orientation = exif.get(ExifTags.Base.Orientation, 1)
     return HeldCamera(
-        text(exif, ExifTags.Base.Make),
-        text(exif, ExifTags.Base.Model),
-        text(taken, ExifTags.Base.FocalLength),
-        text(taken, ExifTags.Base.FocalLengthIn35mmFilm),
-        text(taken, ExifTags.Base.DigitalZoomRatio),
-        orientation if orientation in range(1, 9) else 1,
-        width,
-        height,
+        make=text(exif, ExifTags.Base.Make),
+        model=text(exif, ExifTags.Base.Model),
+        focal_mm=text(taken, ExifTags.Base.FocalLength),
+        focal_35mm=text(taken, ExifTags.Base.FocalLengthIn35mmFilm),
+        zoom=text(taken, ExifTags.Base.DigitalZoomRatio),
+        orientation=orientation if orientation in range(1, 9) else 1,
+        width=width,
+        height=height,
     )

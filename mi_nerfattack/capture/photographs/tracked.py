@@ -146,13 +146,13 @@ def fit_tracked(structure: Structure, tracked: Tracked) -> HandEye:
     mount[:3, :3] = Rotation.from_rotvec(fit.x[:3]).as_matrix()
     mount[:3, 3] = fit.x[6:9]
     return HandEye(
-        float(np.exp(fit.x[12])),
-        Rotation.from_rotvec(fit.x[3:6]).as_matrix().tolist(),
-        fit.x[9:12].tolist(),
-        mount.tolist(),
-        off,
-        float(np.degrees(angle)),
-        len(shared),
+        scale=float(np.exp(fit.x[12])),
+        rotation=Rotation.from_rotvec(fit.x[3:6]).as_matrix().tolist(),
+        translation=fit.x[9:12].tolist(),
+        camera_to_body=mount.tolist(),
+        residual_m=off,
+        residual_deg=float(np.degrees(angle)),
+        photographs=len(shared),
     )
 
 

@@ -117,7 +117,7 @@ def read_left_eye(path: Path, mode: str = "VGA") -> EyeCalibration:
     fx, fy, cx, cy = (_number(where, parser[section], name) for name in _PINHOLE)
     try:
         # counted from the centre of the first pixel there, from its corner here
-        pinhole = Camera(width, height, fx, fy, cx + 0.5, cy + 0.5)
+        pinhole = Camera(width, height, fx=fx, fy=fy, cx=cx + 0.5, cy=cy + 0.5)
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
     if not (0 < pinhole.cx < width and 0 < pinhole.cy < height):

@@ -161,12 +161,12 @@ class DriveConfig(Section):
         route = Route.from_file(path, self.route)
         speed = self.speed_ms or route.speed_ms
         return Route(
-            route.name,
-            route.goal,
-            route.points,
-            route.lane_width_m,
-            min(speed, self.max_speed_ms),
-            route.closed,
+            name=route.name,
+            goal=route.goal,
+            points=route.points,
+            lane_width_m=route.lane_width_m,
+            speed_ms=min(speed, self.max_speed_ms),
+            closed=route.closed,
         )
 
     def settings(self, route: Route) -> DriveSettings:

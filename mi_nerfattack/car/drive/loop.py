@@ -230,7 +230,14 @@ class DriveLoop:
             self._notes.append(partial(self._log.frame, frame))
         decision = asked(Cause.PILOT_LOST, devices.pilot.newest)
         held = devices.enable.is_held()
-        return _Readings(self._clock(), frame, pose, values, decision, held)
+        return _Readings(
+            now_s=self._clock(),
+            frame=frame,
+            pose=pose,
+            values=values,
+            decision=decision,
+            is_held=held,
+        )
 
     def _is_due(self, frame: Frame) -> bool:
         period = self._settings.judge.period_s

@@ -153,6 +153,11 @@ def begin_control(
         return partial(http_control, client, route.goal)
     car = config.car
     expert = expert_for(
-        car.control_unit, route, PERIOD_S, car.max_control, car.wheelbase, _LAG_S
+        car.control_unit,
+        route,
+        PERIOD_S,
+        max_control=car.max_control,
+        wheelbase=car.wheelbase,
+        lag=_LAG_S,
     )
     return partial(expert_control, expert, tracker, config.body)

@@ -190,13 +190,13 @@ class VescMotor(AbstractMotor):
             None if values.erpm is None else values.erpm / self.calibration.erpm_per_ms
         )
         return MotorValues(
-            time_s,
-            speed,
-            values.motor_current_a,
-            values.input_voltage_v,
-            values.fet_temperature_c,
-            values.fault or 0,
-            fault_name(values.fault or 0),
-            values.has_timed_out,
-            values.is_killed,
+            time_s=time_s,
+            speed_ms=speed,
+            motor_current_a=values.motor_current_a,
+            input_voltage_v=values.input_voltage_v,
+            fet_temperature_c=values.fet_temperature_c,
+            fault=values.fault or 0,
+            fault_name=fault_name(values.fault or 0),
+            has_timed_out=values.has_timed_out,
+            is_killed=values.is_killed,
         )

@@ -252,7 +252,14 @@ class ProgressBar:
         over = total is not None and done >= total
         if over or now - self._shown >= _EVERY_S:
             self._shown = now
-            state = _State(stage, done, total, remark, self._first, now - self._start)
+            state = _State(
+                stage,
+                done,
+                total,
+                remark=remark,
+                first=self._first,
+                elapsed_s=now - self._start,
+            )
             self._display.show(state, over)
         if over:
             self._current, self._steps = None, 0

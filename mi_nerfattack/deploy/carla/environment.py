@@ -107,7 +107,9 @@ class CarlaEnvironment(AbstractEnvironment):
                 self.session, self.camera, self._actor, body_to_camera, self._attributes
             )
             frame, speed = 0, route.speed_ms
-            self.driver.begin(self.session, self._actor, axles, start, speed, height)
+            self.driver.begin(
+                self.session, self._actor, axles, pose=start, speed=speed, height=height
+            )
             for _ in range(max(1, round(_SETTLE_S / self.period))):
                 frame = self.session.tick()
             camera_frame = self._observe(frame)

@@ -112,7 +112,10 @@ def town_routes(
             f"{path}: no route {unknown[0]!r} in {town!r}; it has {', '.join(routes)}"
         )
     chosen = [routes[name] for name in names or routes]
-    return [_along_lanes(path, town_map, api, each, goal, speed_ms) for each in chosen]
+    return [
+        _along_lanes(path, town_map, api, route=each, goal=goal, speed_ms=speed_ms)
+        for each in chosen
+    ]
 
 
 def _along_lanes(

@@ -99,7 +99,7 @@ def read_lighting(scene: Any) -> Lighting:
     if not emitters:
         above, beside = _indoor_irradiance(scene)
         sun, sky = np.maximum(above - beside, 0), beside
-        return Lighting(direction, sun, sky, _sky_faces([]), False)
+        return Lighting(direction, sun, sky, faces=_sky_faces([]), has_shadows=False)
     return Lighting(direction, sun, sky, _sky_faces(emitters))
 
 

@@ -76,7 +76,12 @@ def built_in_mesh(index: int, item: BuiltInObject) -> DrawnMesh:
     image = srgb_to_linear_numpy(item.image.astype(np.float32) / 255)
     normals = None if item.normals is None else item.normals @ item.pose.rotation.T
     return DrawnMesh(
-        f"built_in_{index:03d}", item.world_vertices, item.faces, normals, uv, image
+        f"built_in_{index:03d}",
+        item.world_vertices,
+        item.faces,
+        normals=normals,
+        uv=uv,
+        texture=image,
     )
 
 

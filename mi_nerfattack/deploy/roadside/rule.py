@@ -104,7 +104,9 @@ class Roadside:
         Raises:
             InputError: no place found for all of them.
         """
-        poses = self.find(fields, surroundings, route, stretch, rng, kinds)
+        poses = self.find(
+            fields, surroundings, route, stretch=stretch, rng=rng, kinds=kinds
+        )
         placed = [pose for pose in poses if pose is not None]
         if len(placed) < len(fields):
             begin, end = stretch
@@ -135,7 +137,7 @@ class Roadside:
             pose = None
             for _ in range(_ROUNDS):
                 stands = self._draw_stands(
-                    shape, scales, surroundings, route, stretch, rng
+                    shape, scales, surroundings, route=route, stretch=stretch, rng=rng
                 )
                 stands = self._free(stands, surroundings, [item for item, _ in placed])
                 chosen = self._first_visible(stands, surroundings, eyes, placed)

@@ -46,7 +46,7 @@ class PixelRays:
         return self._frozen(*pose_arrays(camera_to_world))
 
     def _record(self, origin: mi.Point3f, columns: Any) -> Rays:
-        origins, directions = generate_rays(self.camera, origin, columns, 1)
+        origins, directions = generate_rays(self.camera, origin, columns, n_poses=1)
         far, middle = dr.opaque(mi.Float, dr.inf), dr.opaque(mi.Float, 0.5)
         return Rays(origins, directions, far, middle, dr.opaque(mi.Bool, True))
 

@@ -132,7 +132,7 @@ class Smoothing:
         # The words [stream, number, 1], of 32 bits each, are one more than the noise
         # has. So no start shares its random numbers with the noise of any drive.
         own = (1 << 64) + (number << 32) + stream
-        [start] = initial_states(self.scenario, world.route, 1, own)
+        [start] = initial_states(self.scenario, world.route, count=1, stream=own)
         return Draw(noise, start, int(rng.integers(2**31)))
 
     def nominal(self, world: World, number: int) -> Draw:

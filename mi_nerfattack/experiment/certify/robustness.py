@@ -227,7 +227,15 @@ def certify_robustness(
         smoothing = Smoothing.of(world, label, looks, settings.sd)
         world.open(label).close()  # what cannot be made is reported before hours
         store = Store(output / DRIVES)
-        job = _Job(world, settings, smoothing, looks, store, workers, on_stage)
+        job = _Job(
+            world,
+            settings,
+            smoothing,
+            looks=looks,
+            store=store,
+            workers=workers,
+            on_stage=on_stage,
+        )
         with one_thread():
             centre, direction = job.centre()
             points = job.search(direction)

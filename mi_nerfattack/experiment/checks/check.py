@@ -179,13 +179,13 @@ class Check:
             self._environment(label),
             world.policy,
             world.route,
-            start,
-            seed,
-            horizon,
-            on_step,
-            case,
-            run,
-            label,
+            pose=start,
+            seed=seed,
+            steps=horizon,
+            on_step=on_step,
+            case=case,
+            run=run,
+            label=label,
         )
         self._period_s[label] = float(np.median(np.diff(times)))
         self.drives.append(driven)
@@ -255,11 +255,21 @@ class Check:
             view.show(objects)
             pose = mount_matrix(world.initial[:1], mount)[0]
             behind = view.render(pose, 0).image
-            looks["Start, from behind the car"] = Look(behind, camera, pose, True)
+            looks["Start, from behind the car"] = Look(
+                behind, camera, pose, from_behind=True
+            )
         lines = [f"REFUSED: {line}" for line in self.refused]
         lines += [f"LOOK AT: {line}" for line in self.doubts]
         name = world.scenario.name
-        place_picture(path, overlay, overhead, grounds, looks, lines, name)
+        place_picture(
+            path,
+            overlay,
+            overhead,
+            grounds=grounds,
+            looks=looks,
+            sentences=lines,
+            title=name,
+        )
 
     def _overlay(self) -> Overlay:
         world = self.world
@@ -272,14 +282,14 @@ class Check:
             if d.run == 0 and d.case == OWN
         }
         return Overlay(
-            [world.route],
-            (float(arc[0]), float(arc[-1])),
-            dict(zip(names, object_footprints(posed), strict=True)),
-            {n: _top(item) for n, item in zip(names, posed, strict=True)},
-            world.initial,
-            scenario.vehicle.width_m,
-            world.surrogate.intrinsics,
-            paths,
+            routes=[world.route],
+            driven=(float(arc[0]), float(arc[-1])),
+            objects=dict(zip(names, object_footprints(posed), strict=True)),
+            tops={n: _top(item) for n, item in zip(names, posed, strict=True)},
+            starts=world.initial,
+            car_width_m=scenario.vehicle.width_m,
+            camera=world.surrogate.intrinsics,
+            paths=paths,
         )
 
 

@@ -102,14 +102,14 @@ def estimate(world: World, drive_s: Mapping[str, float]) -> Cost:
     frames = section.poses * (again * passes * rendered + (looks + 1) * horizon)
     frames += sum(periods.values()) * horizon
     return Cost(
-        count,
-        looks,
-        horizon,
-        frames,
-        wall,
-        peak_memory_mb() + backgrounds_mb(world),
-        disk + _PICTURES_MB,
-        {"forward": forward, "backward": backward, **drive_s},
+        iterations=count,
+        random_looks=looks,
+        horizon=horizon,
+        frames=frames,
+        wall_s=wall,
+        memory_mb=peak_memory_mb() + backgrounds_mb(world),
+        disk_mb=disk + _PICTURES_MB,
+        period_s={"forward": forward, "backward": backward, **drive_s},
     )
 
 

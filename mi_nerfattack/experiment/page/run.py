@@ -201,7 +201,11 @@ def _turntables(folder: Path, document: Mapping[str, Any]) -> list[Scrubber]:
             views = turntable(load_grid(path), VIEWS, VIEW_PX)
             panes.append(make_pane(item["id"], alt, views, turns))
     title = "Objects as the attack left them"
-    return [Scrubber(title, tuple(panes), 0, TURN_S / VIEWS)] if panes else []
+    return (
+        [Scrubber(title, tuple(panes), start=0, period_s=TURN_S / VIEWS)]
+        if panes
+        else []
+    )
 
 
 def _drive_scrubber(

@@ -53,12 +53,16 @@ def read_sweep(
         )
     attacks = _attacks(folder, table, sections)
     return SweepPart(
-        label,
-        summarise(table, attack_rows),
-        attacks,
-        _shown(cells, [row for row in attacks if row["cell"] in sections], on_run),
-        _pictures(cells, table, sections, Path(tempfile.mkdtemp(dir=scratch)), notes),
-        notes,
+        label=label,
+        document=summarise(table, attack_rows),
+        attacks=attacks,
+        shown=_shown(
+            cells, [row for row in attacks if row["cell"] in sections], on_run
+        ),
+        pictures=_pictures(
+            cells, table, sections, Path(tempfile.mkdtemp(dir=scratch)), notes
+        ),
+        notes=notes,
     )
 
 

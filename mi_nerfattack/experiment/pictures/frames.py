@@ -105,9 +105,9 @@ class FrameFolder:
             self.path / "transforms.json",
             self._names,
             self.rig.cameras[0],
-            np.stack(self._poses),
-            {"units": "metre", "depth_file": "depth.safetensors"},
-            self._times,
+            camera_to_world=np.stack(self._poses),
+            extra={"units": "metre", "depth_file": "depth.safetensors"},
+            times_s=self._times,
         )
 
 
@@ -312,7 +312,14 @@ class Film:
         # path-traced light sources may exceed the range of half precision
         half = self.drive.environment == SURROGATE
         time_s = moment.step * self.environment.period
-        folder.add(moment.step, time_s, frame, layers, self.describe(moment), half)
+        folder.add(
+            moment.step,
+            time_s,
+            frame,
+            layers=layers,
+            metadata=self.describe(moment),
+            half=half,
+        )
 
     def describe(self, moment: Moment) -> dict[str, str]:
         """Say what a frame shows; see :func:`frame_metadata`."""

@@ -101,7 +101,7 @@ def _write_triptych(output: Path, done: Finished) -> None:
     ground_points = np.concatenate([*points, *footprints])
     above = Overhead.covering(ground_points, route.lane_width_m, _GROUND_PX)
     scene = mesh_scene(world)
-    bare = None if scene is None else scene_above(scene, above, points[0], 4)
+    bare = None if scene is None else scene_above(scene, above, points[0], spp=4)
     panels = []
     for (case, label), drives in zip(pairs, groups, strict=True):
         world.show(done.look(case))

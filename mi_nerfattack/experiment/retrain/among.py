@@ -285,10 +285,10 @@ class FramesAmong:
             self.sites,
             self.routes,
             self.settings,
-            self.folder,
-            self.workers,
-            progress,
-            AmongFound(tuple(self.attacks)),
+            folder=self.folder,
+            workers=self.workers,
+            progress=progress,
+            staging=AmongFound(tuple(self.attacks)),
         )
 
     def imitate(
@@ -299,12 +299,12 @@ class FramesAmong:
             self.sites,
             self.routes,
             self.settings,
-            self.folder,
-            self.workers,
-            progress,
-            start,
-            earlier_shards,
-            AmongFound(tuple(self.attacks)),
+            folder=self.folder,
+            workers=self.workers,
+            progress=progress,
+            start=start,
+            earlier_shards=earlier_shards,
+            staging=AmongFound(tuple(self.attacks)),
         )
 
     @property

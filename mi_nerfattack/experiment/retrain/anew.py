@@ -63,12 +63,12 @@ def _cell(attack: FoundAttack, policy: str) -> Cell:
     scenario, text = read_with_policy(attack, policy)
     ids = "+".join(item.id for item in scenario.objects)
     return Cell(
-        axis_name(attack.route.name),
-        axis_name(ids),
-        scenario.attack.method.kind,
-        None,
-        scenario.seed,
-        portable_text(scenario, text),
-        scenario.digests(),
+        route=axis_name(attack.route.name),
+        objects=axis_name(ids),
+        method=scenario.attack.method.kind,
+        budget=None,
+        seed=scenario.seed,
+        text=portable_text(scenario, text),
+        digests=scenario.digests(),
         anyway=True,
     )

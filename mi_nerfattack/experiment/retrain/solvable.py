@@ -74,7 +74,7 @@ def drive_expert(attack: FoundAttack) -> Driven:
     objects = [item for item in attacked_objects(attack) if _is_in_the_way(item)]
     outlines = np.concatenate([np.zeros((0, 2)), *map(_outline, objects)])
     errors, gaps = [], []
-    for pose in initial_states(scenario, route, scenario.drive.runs, 0):
+    for pose in initial_states(scenario, route, count=scenario.drive.runs, stream=0):
         vehicle.reset(pose, route.speed_ms)
         states = [vehicle.state[:3]]
         for _ in range(attack.horizon):

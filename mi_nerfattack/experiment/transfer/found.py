@@ -102,14 +102,14 @@ class FoundAttack:
         """
         stream = _FIRST_STREAM + number
         like = self.scenario.model_copy(update={"seed": seed})
-        pose = initial_states(like, self.route, 1, stream)[0]
+        pose = initial_states(like, self.route, count=1, stream=stream)[0]
         sequence = np.random.SeedSequence([seed, stream])
         return pose, int(sequence.generate_state(1)[0] >> 1)
 
     def check_starts(self, seed: int, count: int) -> None:
         """Raise InputError if the attack has seen one of the starts."""
         scenario, route = self.scenario, self.route
-        evaluated = initial_states(scenario, route, scenario.drive.runs, 0)
+        evaluated = initial_states(scenario, route, count=scenario.drive.runs, stream=0)
         poses = np.concatenate([evaluated, optimised_states(scenario, route)])
         for number in range(count):
             pose, _ = self.start(seed, number)
@@ -166,12 +166,12 @@ def _read(folder: Path, label: str) -> FoundAttack:
         folder,
         label,
         scenario,
-        driven_route(scenario, scenario.vehicle.motion()),
-        offsets,
-        (document.get("baseline") or {}).get("best"),
-        identity,
-        _digest(folder, scenario, offsets),
-        _surrogate(scenario.scene, identity),
+        route=driven_route(scenario, scenario.vehicle.motion()),
+        offsets=offsets,
+        best_random=(document.get("baseline") or {}).get("best"),
+        identity=identity,
+        digest=_digest(folder, scenario, offsets),
+        surrogate=_surrogate(scenario.scene, identity),
     )
 
 

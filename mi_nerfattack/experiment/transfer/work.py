@@ -198,13 +198,13 @@ class TransferDriver(AbstractDriver):
             environment,
             world.policy,
             world.route,
-            pose,
-            spec.seed,
-            spec.steps,
-            on_step,
-            batch.case,
-            spec.run,
-            spec.environment,
+            pose=pose,
+            seed=spec.seed,
+            steps=spec.steps,
+            on_step=on_step,
+            case=batch.case,
+            run=spec.run,
+            label=spec.environment,
         )
 
     def close(self) -> None:

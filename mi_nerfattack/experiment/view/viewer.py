@@ -130,7 +130,9 @@ class Viewer:
     def _add_time(self, gui: viser.GuiApi, drive: Drive) -> None:
         names = [drive_name(item) for item in self.viewed.shown]
         self.choice = gui.add_dropdown("Drive", names, initial_value=drive_name(drive))
-        self.slider = gui.add_slider("Period", 0, len(drive.controls), 1, 0)
+        self.slider = gui.add_slider(
+            "Period", min=0, max=len(drive.controls), step=1, initial_value=0
+        )
         self.play = gui.add_button("Play")
         self.description = gui.add_markdown("")
         width, height = self.viewed.world.place.rig.size

@@ -159,19 +159,19 @@ def bake(
         baked = BrickField(
             field.lower,
             field.upper,
-            plan.occupancy,
-            plan.subdivisions,
-            _first_vertices(scene, plan, codes, mount.height_m),
-            codes,
-            field.tensors()["sky"],
-            field.step_m,
-            field.cone,
-            {**field.info, **_provenance(options)},
+            occupancy=plan.occupancy,
+            subdivisions=plan.subdivisions,
+            vertices=_first_vertices(scene, plan, codes, mount.height_m),
+            codes=codes,
+            sky=field.tensors()["sky"],
+            step_m=field.step_m,
+            cone=field.cone,
+            info={**field.info, **_provenance(options)},
         )
         progress(0, options.passes)
         for step in range(options.passes):
             poses = drive_poses(routes, options.views, _seed(options, step), mount)
-            _refine(baked, scene, camera, poses, options, step)
+            _refine(baked, scene, camera, poses=poses, options=options, step=step)
             progress(step + 1, options.passes)
     return baked
 
@@ -260,7 +260,12 @@ def _refine(
         rays = _rays(camera, poses[start : start + at_once], seed)
         walk, active = Walk.start(posed, rays)
         heading = dr.normalize(posed.turn(rays.direction))
-        dr.eval(_add_differences(baked, posed, walk, active, heading, sums), sums)
+        dr.eval(
+            _add_differences(
+                baked, posed, walk, active=active, heading=heading, sums=sums
+            ),
+            sums,
+        )
     *moves, weight = sums
     rate = dr.rcp(dr.maximum(weight, _FAINT))
     pairs = zip(unpack_word(baked.vertices), moves, strict=True)
@@ -283,7 +288,9 @@ def _add_differences(
     while active:
         walk, segment = walk.next([posed], active)
         active = segment.active
-        depth = _add_sample(baked, posed, walk, segment, heading, depth, sums)
+        depth = _add_sample(
+            baked, posed, walk, segment=segment, heading=heading, depth=depth, sums=sums
+        )
         active &= dr.exp(-depth) > STOP
     return depth
 

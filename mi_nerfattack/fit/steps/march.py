@@ -63,9 +63,9 @@ class MarchStep:
                 dr.ADMode.Backward,
                 self.posed,
                 rays,
-                primal,
-                cotangent,
-                STOP,
+                primal=primal,
+                cotangent=cotangent,
+                stop=STOP,
                 with_rays=self.source.learns_poses,
             )
         if self.source.learns_poses:

@@ -130,7 +130,12 @@ class PointStep:
         with dr.suspend_grad():
             spread = self._spread(samples, values)
             by_depth, by_colour = cotangents(
-                samples, values, colours, primal, cotangent, spread
+                samples,
+                values,
+                colours,
+                primal=primal,
+                cotangent=cotangent,
+                spread=spread,
             )
             score.loss += dr.sum(spread.penalty) * self.source.weights.spread
             dr.eval(by_depth, by_colour)

@@ -52,12 +52,12 @@ def list_samples(posed: PosedField, rays: Rays, capacity: int) -> Samples:
     count = mi.UInt32(sample_count(posed, rays))
     first, fits = _places(count, capacity)
     samples = Samples(
-        first,
-        dr.select(fits, count, 0),
-        fits & rays.active,
-        dr.zeros(mi.UInt32, capacity),
-        dr.zeros(mi.Float, capacity),
-        dr.zeros(mi.Float, capacity),
+        first=first,
+        count=dr.select(fits, count, 0),
+        fits=fits & rays.active,
+        ray=dr.zeros(mi.UInt32, capacity),
+        t=dr.zeros(mi.Float, capacity),
+        width=dr.zeros(mi.Float, capacity),
     )
     dr.make_opaque(samples)
     _fill(posed, rays, samples)
@@ -87,12 +87,12 @@ def keep_visible(
     _list_slots(samples.first, first, count, slots)
     dr.eval(slots)
     return Samples(
-        first,
-        count,
-        samples.fits & fits,
-        dr.gather(mi.UInt32, samples.ray, slots),
-        dr.gather(mi.Float, samples.t, slots),
-        dr.gather(mi.Float, samples.width, slots),
+        first=first,
+        count=count,
+        fits=samples.fits & fits,
+        ray=dr.gather(mi.UInt32, samples.ray, slots),
+        t=dr.gather(mi.Float, samples.t, slots),
+        width=dr.gather(mi.Float, samples.width, slots),
     ), slots
 
 
@@ -234,7 +234,14 @@ def measure_spread(
         tau += x
         slot += 1
         active &= slot < end
-    return Spread(factor, position, width, before, moment, penalty)
+    return Spread(
+        factor=factor,
+        position=position,
+        width=width,
+        weight=before,
+        moment=moment,
+        penalty=penalty,
+    )
 
 
 @dr.syntax

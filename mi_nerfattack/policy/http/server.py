@@ -209,7 +209,9 @@ class _Handler(BaseHTTPRequestHandler):
             # of the bytes that came: fewer than those of the images that they become
             header = str(self.headers.get("X-Numbers", ""))
             request = hashlib.blake2b(body + f"{goals} {header}".encode()).digest()
-            controls = server.decide(client, request, images, goals, step, numbers)
+            controls = server.decide(
+                client, request, images, goals=goals, step=step, numbers=numbers
+            )
             answer = {"control": controls}
         except RefusedError as refusal:
             self.close_connection = True  # whatever the client still sends

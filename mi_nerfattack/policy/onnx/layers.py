@@ -33,7 +33,7 @@ def convolve(call: Call) -> torch.Tensor:
     kernel = list(weight.shape[2:])
     strides = call.attribute("strides", [1] * axes)
     dilations = call.attribute("dilations", [1] * axes)
-    x = _padded(call, call.x, kernel, strides, dilations, 0.0)
+    x = _padded(call, call.x, kernel, strides=strides, dilations=dilations, value=0.0)
     group = call.attribute("group", 1)
     return _CONVOLUTIONS[axes](
         x, weight, call.get(2), strides, 0, list(dilations), group
@@ -71,7 +71,9 @@ def max_pool(call: Call) -> torch.Tensor:
     """MaxPool: values alone, without their indices."""
     kernel, strides, axes = _window(call)
     dilations = call.attribute("dilations", [1] * axes)
-    x = _padded(call, call.x, kernel, strides, dilations, float("-inf"))
+    x = _padded(
+        call, call.x, kernel, strides=strides, dilations=dilations, value=float("-inf")
+    )
     ceil = bool(call.attribute("ceil_mode", 0))
     if ceil and any(s > k for s, k in zip(strides, kernel, strict=True)):
         raise InputError(
@@ -88,11 +90,15 @@ def average_pool(call: Call) -> torch.Tensor:
     ones = [1] * axes
     call.only("dilations", ones)
     mean = _AVERAGE_POOLS[axes]
-    result = mean(_padded(call, call.x, kernel, strides, ones, 0.0), kernel, strides)
+    result = mean(
+        _padded(call, call.x, kernel, strides=strides, dilations=ones, value=0.0),
+        kernel,
+        strides,
+    )
     if call.attribute("count_include_pad", 0):
         return result
     inside = torch.ones_like(call.x[:1, :1])
-    inside = _padded(call, inside, kernel, strides, ones, 0.0)
+    inside = _padded(call, inside, kernel, strides=strides, dilations=ones, value=0.0)
     return result / mean(inside, kernel, strides)
 
 

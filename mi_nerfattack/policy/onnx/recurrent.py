@@ -22,14 +22,16 @@ def lstm(call: Call) -> tuple[torch.Tensor, ...]:
     if call.get(7) is not None:
         raise InputError("LSTM: peepholes are not supported")
     call.only("input_forget", 0)
-    return _layer(call, _lstm_cell, 4, ["Sigmoid", "Tanh", "Tanh"], 2)
+    return _layer(
+        call, _lstm_cell, gates=4, activations=["Sigmoid", "Tanh", "Tanh"], states=2
+    )
 
 
 def gru(call: Call) -> tuple[torch.Tensor, ...]:
     """GRU: gates in the order update, reset, hidden."""
     before = bool(call.attribute("linear_before_reset", 0))
     cell = _gru_cell if before else _gru_cell_reset_first
-    return _layer(call, cell, 3, ["Sigmoid", "Tanh"], 1)
+    return _layer(call, cell, gates=3, activations=["Sigmoid", "Tanh"], states=1)
 
 
 def _lstm_cell(

@@ -89,11 +89,11 @@ class Disturbance:
             image,
             exposures,
             blurs,
-            self.noise_sd,
-            self.seed,
-            step,
-            self.first,
-            layout,
+            noise_sd=self.noise_sd,
+            seed=self.seed,
+            step=step,
+            first=self.first,
+            layout=layout,
         )
 
     def vjp(
@@ -142,7 +142,17 @@ def disturbed(
         images = []
         for k, part in enumerate(layout.split(image)):
             own = camera_seed(seed, k)
-            images.append(disturbed(part, exposures, blurs, noise_sd, own, step, first))
+            images.append(
+                disturbed(
+                    part,
+                    exposures,
+                    blurs,
+                    noise_sd=noise_sd,
+                    seed=own,
+                    step=step,
+                    first=first,
+                )
+            )
         return side_by_side(images, layout)
     kind, shape, value = type(image.array), image.shape, image.array
     if exposures.any() or blurs.any():

@@ -157,7 +157,7 @@ def from_fov(width: int, height: int, fov_x_deg: float) -> Camera:
     if not 0 < fov_x_deg < 180:
         raise InputError(f"fov_x_deg: {fov_x_deg}; must be between 0 and 180 degrees")
     focal = 0.5 * width / math.tan(math.radians(0.5 * fov_x_deg))
-    return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height)
+    return Camera(width, height, fx=focal, fy=focal, cx=0.5 * width, cy=0.5 * height)
 
 
 def ray_slopes(camera: Camera) -> tuple[np.ndarray, np.ndarray]:

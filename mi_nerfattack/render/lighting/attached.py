@@ -89,7 +89,12 @@ class _Render(dr.CustomOp):
         cotangent = Marches(March(radiance, opacity, mi.Float(0)))
         posed, rays = self.fixed
         gradients = self.composite.backward_rays(
-            posed, rays, self.primal, cotangent, self.stop, range(len(posed))
+            posed,
+            rays,
+            self.primal,
+            cotangent=cotangent,
+            stop=self.stop,
+            layers=range(len(posed)),
         )
         for item, by_rays in zip(posed, gradients, strict=True):
             item.backward_pose(rays, by_rays)

@@ -145,7 +145,9 @@ class Relighting:
             sample -= dr.floor(sample)
             wavelengths, weight = _wavelengths(turn + i * _SILVER)
             it.wavelengths = wavelengths
-            ds, light = scene.sample_emitter_direction(it, sample, not walks, active)
+            ds, light = scene.sample_emitter_direction(
+                it, sample, test_visibility=not walks, active=active
+            )
             cosine = dr.maximum(dr.dot(surface.normal, ds.d), 0)
             light = _to_rgb(light * weight, wavelengths) * (cosine / self.samples)
             is_far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)

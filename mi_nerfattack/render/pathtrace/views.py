@@ -129,7 +129,9 @@ class ViewRenderer:
         film = {"pixel_format": "rgba"}
         self.scene, self.camera = scene, camera
         self._integrator = scene.integrator() if integrator is None else integrator
-        self._sensor = mi.load_dict(mitsuba_sensor_dict(camera, np.eye(4), 1, film))
+        self._sensor = mi.load_dict(
+            mitsuba_sensor_dict(camera, np.eye(4), spp=1, film=film)
+        )
         self._parameters = mi.traverse(self._sensor)
         _evaluate_means(scene)
         self._frozen: Callable[..., Any] | None

@@ -178,7 +178,7 @@ class SplatBackground(AbstractBackdrop):
             fixed = pick_rays([primal, cotangent], where.order)
             with private_gradients():
                 tangent, by_rays = replay(
-                    mode, lines, lists, shades, *fixed, stop, with_rays
+                    mode, lines, lists, shades, *fixed, stop=stop, with_rays=with_rays
                 )
                 dr.eval(tangent, by_rays)
             if mode == dr.ADMode.Forward:

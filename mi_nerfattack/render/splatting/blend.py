@@ -60,7 +60,14 @@ def by_cell(rays: Rays, where: Sorted, lists: Lists) -> Lines:
     begin = dr.gather(mi.UInt32, lists.start, cell)
     end = begin + dr.gather(mi.UInt32, lists.length, cell)
     active = rays.active & (end > begin) & (rays.t_max > 0)
-    return Lines(origin, direction, mi.Float(rays.t_max), active, begin, end)
+    return Lines(
+        origin,
+        direction,
+        t_max=mi.Float(rays.t_max),
+        active=active,
+        begin=begin,
+        end=end,
+    )
 
 
 @dr.syntax
@@ -71,7 +78,9 @@ def blend(rays: Lines, lists: Lists, shades: mi.Float, stop: float) -> March:
     moment = mi.Float(0)
     passed = mi.Float(1)  # transmittance so far
     while active:
-        window, hit, is_hit = _next(rays, lists, shades, window, place, active)
+        window, hit, is_hit = _next(
+            rays, lists, shades, window=window, place=place, active=active
+        )
         shade = dr.gather(mi.Vector4f, shades, hit.index, is_hit)
         weight = passed * hit.opacity
         display += weight * mi.Color3f(shade.xyz)
@@ -169,7 +178,7 @@ def _next(
     index = dr.gather(mi.UInt32, lists.index, place, inside)
     shade = dr.gather(mi.Vector4f, shades, index, inside)
     peak, opacity, squared = _meet(
-        rays.origin, rays.direction, lists, shade, index, inside
+        rays.origin, rays.direction, lists, shade=shade, index=index, active=inside
     )
     met = inside & (squared <= REACH**2) & (peak > 0) & (peak < rays.t_max)
     none = dr.select(place < rays.end, mi.Float(-dr.inf), mi.Float(dr.inf))

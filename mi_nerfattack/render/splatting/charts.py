@@ -115,7 +115,17 @@ def sort_rays(origin: mi.Point3f, direction: mi.Vector3f) -> Sorted:
     size = dr.clip(size, LEAST, LARGEST)
     counts = [dr.select(some, mi.UInt32(x / size) + 1, 0) for x in (width, height)]
     first = dr.prefix_sum(counts[0] * counts[1])
-    charts = Charts(origin, spread, axes, low, high, size, counts, first, rays)
+    charts = Charts(
+        origin,
+        spread,
+        axes,
+        low=low,
+        high=high,
+        size=size,
+        counts=counts,
+        first=first,
+        rays=rays,
+    )
     dr.eval(charts)
     cells = int(dr.sum(counts[0] * counts[1])[0])
     own = pick_rays(charts, view)
@@ -127,7 +137,14 @@ def sort_rays(origin: mi.Point3f, direction: mi.Vector3f) -> Sorted:
     occupied = dr.zeros(mi.UInt32, cells)
     dr.scatter(occupied, mi.UInt32(1), cell)
     dr.eval(view, cell, occupied)
-    return Sorted(charts, view, cell, dr.argsort(cell), cells, occupied)
+    return Sorted(
+        charts,
+        chart=view,
+        cell=cell,
+        order=dr.argsort(cell),
+        cells=cells,
+        occupied=occupied,
+    )
 
 
 def _origins(origin: mi.Point3f, count: int) -> tuple[mi.Point3f, mi.UInt32, mi.Float]:

@@ -159,24 +159,40 @@ def judge(
         )
 
     psnr, worst = mean(scores, "psnr_db"), least(scores, "psnr_db")
-    add("views", subject.views, len(scores), MIN_VIEWS, True, subject.few)
+    add(
+        "views",
+        subject.views,
+        len(scores),
+        MIN_VIEWS,
+        at_least=True,
+        advice=subject.few,
+    )
     name = f"mean PSNR of {subject.views} (dB)"
-    add("psnr_db", name, psnr, MIN_PSNR_DB, True, subject.blurred)
+    add("psnr_db", name, psnr, MIN_PSNR_DB, at_least=True, advice=subject.blurred)
     name = f"least PSNR of {subject.views} (dB)"
-    add("psnr_min_db", name, worst, MIN_WORST_DB, True, subject.worst)
+    add("psnr_min_db", name, worst, MIN_WORST_DB, at_least=True, advice=subject.worst)
     name = f"share of rays with an opacity from {HAZY[0]:g} to {HAZY[1]:g}"
-    add("hazy", name, mean(scores, "hazy"), MAX_HAZY, False, subject.fog)
+    add(
+        "hazy", name, mean(scores, "hazy"), MAX_HAZY, at_least=False, advice=subject.fog
+    )
     if not np.isnan(holes := mean(scores, "holes")):
         name = f"share of known surfaces with an opacity below {SOLID:g}"
-        add("holes", name, holes, MAX_HOLES, False, subject.holes)
+        add("holes", name, holes, MAX_HOLES, at_least=False, advice=subject.holes)
     if not np.isnan(depth_m):
         name = "median error of the depth near the camera (m)"
-        add("depth_median_m", name, depth_m, MAX_DEPTH_M, False, subject.depth)
+        add(
+            "depth_median_m",
+            name,
+            depth_m,
+            MAX_DEPTH_M,
+            at_least=False,
+            advice=subject.depth,
+        )
     if fitted_db is not None:
         pooled = pooled_db([score.psnr_db for score in scores])
         gap = 0.0 if pooled == fitted_db else fitted_db - pooled  # both may be infinite
         name = "PSNR of fitted rays less that of held-out ones (dB)"
-        add("gap_db", name, gap, MAX_GAP_DB, False, subject.learnt)
+        add("gap_db", name, gap, MAX_GAP_DB, at_least=False, advice=subject.learnt)
     return criteria
 
 

@@ -247,8 +247,10 @@ def plot_attribution(
 def _draw_costates(axis: Axes, data: TimeAttribution) -> None:
     shift = np.linalg.norm(data.costates[..., :2], axis=-1)
     turn = np.abs(data.costates[..., 2])
-    _draw_batch(axis, data, shift, BLUE, "shift, per metre", "-")
-    _draw_batch(axis, data, turn, ORANGE, "turn, per radian", (0, (5, 1.2)))
+    _draw_batch(axis, data, shift, colour=BLUE, label="shift, per metre", style="-")
+    _draw_batch(
+        axis, data, turn, colour=ORANGE, label="turn, per radian", style=(0, (5, 1.2))
+    )
     axis.set_ylabel("|d cost / d state|")
     axis.set_ylim(bottom=0)
     _legend_above(axis)
@@ -281,7 +283,14 @@ def _draw_shares(axis: Axes, data: TimeAttribution) -> None:
 
 
 def _draw_errors(axis: Axes, data: TimeAttribution) -> None:
-    _draw_batch(axis, data, np.abs(data.cross_track_m), BLUE, "mean over poses", "-")
+    _draw_batch(
+        axis,
+        data,
+        np.abs(data.cross_track_m),
+        colour=BLUE,
+        label="mean over poses",
+        style="-",
+    )
     axis.axhline(data.limit_m, color="black", linewidth=1, linestyle=":")
     axis.annotate(
         f"departure limit {data.limit_m:.2f} m",

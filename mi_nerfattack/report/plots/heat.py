@@ -56,11 +56,11 @@ class MagnitudeField(AbstractField):
             grid.layout,
             grid.lower,
             grid.upper,
-            density,
-            table,
-            grid.occupancy,
-            grid.density_scale,
-            grid.step_m,
+            density=density,
+            texture=table,
+            occupancy=grid.occupancy,
+            density_scale=grid.density_scale,
+            step_m=grid.step_m,
         )
 
     def eval_everywhere(

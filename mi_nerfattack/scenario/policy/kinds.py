@@ -66,12 +66,12 @@ class AbstractNetworkSection(AbstractPolicySection):
             )
         return TorchPolicy(
             module if batch is None else OneImage(module, recurrent),
-            declared_goal(module) if self.goal is None else self.goal,
-            self.preprocess.build(),
-            recurrent,
-            self.action(),
-            self.build_inputs(views),
-            self.source,
+            goal=declared_goal(module) if self.goal is None else self.goal,
+            preprocess=self.preprocess.build(),
+            recurrent=recurrent,
+            action=self.action(),
+            inputs=self.build_inputs(views),
+            name=self.source,
         )
 
     def _made(self, kind: Any, description: str) -> Any:
@@ -238,12 +238,12 @@ class HttpSection(AbstractPolicySection):
         """Make the client."""
         return HttpPolicy(
             self.url,
-            self.timeout_s,
-            self.retries,
-            self.preprocess.build(),
-            self.action(),
-            self.build_inputs(NO_VIEWS),  # the server gets the frame as it is
-            "" if self.token_file is None else read_token(self.token_file.file),
+            timeout_s=self.timeout_s,
+            retries=self.retries,
+            preprocess=self.preprocess.build(),
+            action=self.action(),
+            inputs=self.build_inputs(NO_VIEWS),  # the server gets the frame as it is
+            token="" if self.token_file is None else read_token(self.token_file.file),
         )
 
 

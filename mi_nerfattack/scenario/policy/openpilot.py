@@ -57,13 +57,13 @@ class OpenpilotSection(AbstractPolicySection):
                 "table [[cameras]] for each of these names"
             )
         module: Any = Openpilot(
-            load_onnx(self.vision_file.file, rounds=True),
-            load_onnx(self.file.file),
-            self.features,
-            self.plan,
-            self.stride,
-            self.traffic,
-            self.steering_delay_s,
+            vision=load_onnx(self.vision_file.file, rounds=True),
+            policy=load_onnx(self.file.file),
+            features=self.features,
+            plan=self.plan,
+            stride=self.stride,
+            traffic=self.traffic,
+            steering_delay_s=self.steering_delay_s,
         )
         recurrent, batch = module.recurrent, module.batch
         if batch not in (None, 1):
@@ -71,12 +71,12 @@ class OpenpilotSection(AbstractPolicySection):
         transforms = (*self.preprocess.build().transforms, PackYuv())
         return TorchPolicy(
             module if batch is None else OneImage(module, recurrent),
-            NoGoal(),
-            Preprocess(transforms, 2, self.frame_stride),
-            recurrent,
-            self.action(),
-            self.build_inputs(views),
-            self.source,
+            goal=NoGoal(),
+            preprocess=Preprocess(transforms, 2, self.frame_stride),
+            recurrent=recurrent,
+            action=self.action(),
+            inputs=self.build_inputs(views),
+            name=self.source,
         )
 
     def build_inputs(self, views: Views) -> Inputs:

@@ -27,7 +27,7 @@ from mi_nerfattack.vehicle.route.polyline import (
 )
 
 _NEEDED = ("goal", "points_m", "lane_width_m", "speed_ms")
-_NUMPY = Operations(np.where, np.sqrt, np.sin, np.cos, np.arctan2, lambda x: x)
+_NUMPY = Operations(np.where, np.sqrt, np.sin, np.cos, np.arctan2, detach=lambda x: x)
 
 
 @dataclass(frozen=True, eq=False)
