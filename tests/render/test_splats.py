@@ -314,8 +314,9 @@ def test_derivatives_by_rays_are_those_of_the_float64_sum(derived, name) -> None
 
 
 def test_derivatives_by_rays_are_0_unless_asked_for(derived) -> None:
-    fixed = derived.rays, derived.seen, derived.cotangent, 0.0
-    _, by_rays = derived.splats.derivative(dr.ADMode.Backward, *fixed)
+    _, by_rays = derived.splats.derivative(
+        dr.ADMode.Backward, derived.rays, derived.primal, derived.cotangent, stop=0.0
+    )
     assert not by_rays.origin.numpy().any() and not by_rays.direction.numpy().any()
 
 
