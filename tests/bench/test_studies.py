@@ -248,6 +248,11 @@ def test_the_parts_of_varying_are_compared_with_nothing():
     ]
     assert "0.50 with `light`" in answer.sentences[0]
     assert "`camera` in 2, `vehicle` in 0" in answer.sentences[1]
+    # at one place, the camera's attack is three times as far as in the other rows
+    far = rows["attack"].str.startswith("right-cars-camera")
+    rows.loc[far, "cross_track_mean_m"] *= 3
+    factors = "by a factor of 12.0 on `right`, and by at most 5.0 on the other"
+    assert factors in made("parts", rows).sentences[2]
 
 
 def test_limits_counts_places_beyond_the_lane():
