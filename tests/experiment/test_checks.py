@@ -260,7 +260,7 @@ def test_anyway_goes_on_and_the_run_remembers(folder, tmp_path, monkeypatch):
         job(folder, output, aloft, stop, notices).run(anyway=True)
     (warning,) = notices
     with monkeypatch.context() as patch:
-        patch.setattr(module, "first_findings", None)  # they are not called
+        patch.setattr(module.before_attack, "first_findings", None)  # not called
         document = job(folder, output, aloft).run()
     assert document["flags"] == [warning.removeprefix("warning: ")]
     # by force it is another scenario, which is checked
