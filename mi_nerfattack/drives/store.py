@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 from mi_nerfattack.drives.spec import FORMAT, DriveSpec
@@ -86,15 +87,7 @@ class Store:
         if stored is None:
             return None
         with misfits_reported(unit.path):
-            drive = Drive(
-                environment=spec.environment,
-                route=spec.route,
-                case=spec.case,
-                run=spec.run,
-                seed=spec.seed,
-                **stored.tensors,
-            )
-            return Finished(drive, stored.record.wall_s)
+            return Finished(_drive(spec, stored.tensors), stored.record.wall_s)
 
     def add(self, spec: DriveSpec, drive: Drive, wall_s: float) -> None:
         """Write a drive.
@@ -161,16 +154,20 @@ def read_drive(path: Path) -> Drive:
     stored = Unit(path, {"format": FORMAT}, DriveRecord, _REMEDY).read(force=True)
     if stored is None:
         raise InputError(f"{path}: missing; it was removed")
-    record = stored.record
     with misfits_reported(path):
-        return Drive(
-            environment=record.environment,
-            route=record.route,
-            case=record.case,
-            run=record.run,
-            seed=record.seed,
-            **stored.tensors,
-        )
+        return _drive(stored.record, stored.tensors)
+
+
+def _drive(labels: DriveSpec | DriveRecord, tensors: Mapping[str, Any]) -> Drive:
+    """Put a drive together from its labels and its arrays."""
+    return Drive(
+        environment=labels.environment,
+        route=labels.route,
+        case=labels.case,
+        run=labels.run,
+        seed=labels.seed,
+        **tensors,
+    )
 
 
 def read_drives(folder: Path) -> list[Drive]:

@@ -201,11 +201,9 @@ def _turntables(folder: Path, document: Mapping[str, Any]) -> list[Scrubber]:
             views = turntable(load_grid(path), VIEWS, VIEW_PX)
             panes.append(make_pane(item["id"], alt, views, turns))
     title = "Objects as the attack left them"
-    return (
-        [Scrubber(title, tuple(panes), start=0, period_s=TURN_S / VIEWS)]
-        if panes
-        else []
-    )
+    if not panes:
+        return []
+    return [Scrubber(title, tuple(panes), start=0, period_s=TURN_S / VIEWS)]
 
 
 def _drive_scrubber(
