@@ -61,9 +61,11 @@ def _walk_through(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
             part, mi.RayFlags.All, coherent=False, active=searching
         )
         met = searching & si.is_valid()
+        # The first surface that no light passes straight ends the search
         passed = dr.max(si.bsdf().eval_null_transmission(si, met)) > 0
         nearest = dr.select(met & ~passed, behind + si.t, nearest)
         searching = met & passed
+        # Other rays go on behind the surface, with the length that is left
         behind += dr.select(searching, si.t, 0)
         part = si.spawn_ray(part.d)
         part.maxt = ray.maxt - behind
@@ -98,6 +100,7 @@ class AbstractSceneMarch(ABC):
 
     def _record(self, rays: Rays, last: mi.UInt32) -> March:
         with dr.suspend_grad():
+            # Bundles of rays cross empty space first; then each ray marches alone
             return self._march(rays, clear_distance(self.posed, rays, last))
 
     @abstractmethod
@@ -156,15 +159,22 @@ class PackedMarch(AbstractSceneMarch):
 
     def march(self, rays: Rays) -> March:
         """See :meth:`AbstractSceneMarch.march`."""
-        if not self._packed.is_current():
+        if not self._packed.is_current():  # a parameter has changed since the copy
             self._packed = PackedNGP(self._field)
         return super().march(rays)
 
     def _march(self, rays: Rays, clear: mi.Float) -> March:
         view = self._packed.view(dr.normalize(self.posed.turn(rays.direction)))
         walk, active = Walk.start(self.posed, rays, clear)
-        posed, looks = [self.posed], ([self._evaluate], [view])
-        result = integrate(posed, walk, active, *looks, self.stop).march()
+        result = integrate(
+            [self.posed],
+            walk,
+            active,
+            evaluate=[self._evaluate],
+            towards=[view],
+            stop=self.stop,
+        ).march()
+        # The table has the light of the capture, so the gain comes after the march
         for (gain,) in [rays.gains] if rays.gains else []:
             result.radiance *= gain.colour
         return result
