@@ -57,6 +57,7 @@ class InterleavedComposite(AbstractComposite):
         if len(lit) == 1:  # nothing to merge
             share = march(lit[0], rays, stop)
             return Marches(share, [share])
+        # Several fields: one loop gathers the share of each, segment by segment
         with dr.suspend_grad():
             walk, active = MergedWalk.start(lit, rays)
             shares = integrate(
@@ -115,6 +116,7 @@ class InterleavedComposite(AbstractComposite):
     def accumulate(self, posed: Sequence[Layer], task: Task, stop: float) -> None:
         """See :meth:`AbstractComposite.accumulate`."""
         mode, rays, fields = dr.ADMode.Backward, task.rays, _fields(posed)
+        # A single field: the derivative of its march, without a merge
         if len(posed) == 1:
             (item,) = rays.light(posed)
             march_derivative(
@@ -126,6 +128,7 @@ class InterleavedComposite(AbstractComposite):
                 stop=stop,
             )
             return
+        # Several fields: one replay of the merged march
         with dr.suspend_grad(), private_gradients():
             _replay(mode, fields, rays, task.primal, task.cotangent, stop, False)
 

@@ -209,6 +209,7 @@ def shares_by_depth(layers: Sequence[March]) -> list[March]:
     """
     depths, shares = [layer.depth for layer in layers], []
     for index, layer in enumerate(layers):
+        # Transmittance of all layers in front of this one, (n,)
         passed = mi.Float(1)
         for other, front in enumerate(layers):
             nearer = depths[other] < depths[index]

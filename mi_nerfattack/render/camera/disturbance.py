@@ -138,6 +138,7 @@ def disturbed(
     Returns:
         a tensor like it; differentiable.
     """
+    # Several cameras: each image by itself, with noise of its own
     if layout is not None and len(layout.sizes) > 1:
         images = []
         for k, part in enumerate(layout.split(image)):
@@ -154,15 +155,18 @@ def disturbed(
                 )
             )
         return side_by_side(images, layout)
+    # One camera: now all values of its images are one flat array
     kind, shape, value = type(image.array), image.shape, image.array
     if exposures.any() or blurs.any():
         # Lens and shutter act on linear light
         value = dr.srgb_to_linear(value)
         if blurs.any():
             value = blur(value, shape, blurs)
+        # One gain per drive and channel, (3 n,); the encoding clips to [0, 1]
         gain = _uploaded(kind, (2.0**exposures).ravel())
         index = _drive_and_channel(value, shape)
         value = dr.linear_to_srgb(value * dr.gather(kind, gain, index))
+    # The noise is normal in sRGB values, so it follows the encoding
     if noise_sd:
         noise = standard_normal(kind, shape, seed, step, first)
         value = value + dr.opaque(kind, noise_sd) * noise  # the image itself stays
@@ -180,10 +184,12 @@ def side_by_side(images: Sequence[Any], layout: Layout) -> Any:
     width, height = layout.size
     kind = type(images[0].array)
     shape = (images[0].shape[0], height, width, 3)
+    # Drive, row, column and channel of each value of the frame
     index = dr.arange(dr.uint32_array_t(kind), math.prod(shape))
     pixel, channel = index // 3, index % 3
     row, column = pixel // width, pixel % width
     image, row = row // height, row % height
+    # Each camera fills its columns; below a lower image the frame stays black
     frame = dr.zeros(kind, math.prod(shape))
     for part, columns, (wide, high) in zip(
         images, layout.columns, layout.sizes, strict=True

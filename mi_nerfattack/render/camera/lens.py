@@ -67,9 +67,11 @@ def lens_rays(
         origins (`mi.Point3f`) and unit directions (`mi.Vector3f`), one per ray.
     """
     fx, fy, cx, cy, *distortion = lens
+    # Distorted positions on the image plane, at unit distance
     x = (position.x - cx) / fx
     y = (position.y - cy) / fy
     right, down, forward = rotation
+    # Undistorted directions; a fisheye also sees 90 degrees and more from its axis
     if len(distortion) > 4:
         x, y, z = direction(x, y, *distortion[:4])
         towards = dr.normalize(right * x + down * y + forward * z)
@@ -77,6 +79,7 @@ def lens_rays(
         if distortion:
             x, y = undistort(x, y, *distortion)
         towards = dr.normalize(right * x + down * y + forward)
+    # An origin for all rays becomes one entry per ray
     origins = mi.Point3f(origin)
     for i in range(3):
         if dr.width(origins[i]) == 1:
@@ -110,6 +113,7 @@ def mount_pose(
         (`mi.Vector3f`, unit length), one entry per vehicle.
     """
     px, py, theta = (mi.Float(value) for value in state)
+    # The numbers of the mount: opaque, or one entry per vehicle
     if isinstance(pitch_deg, mi.Float):
         pitch = pitch_deg * (math.pi / 180)
     else:
@@ -120,6 +124,7 @@ def mount_pose(
     )
     sin_pitch, cos_pitch = dr.sincos(pitch)
     sin_theta, cos_theta = dr.sincos(theta)
+    # The offsets turn with the vehicle, not with the camera's yaw
     origin = mi.Point3f(
         px + ahead * cos_theta - left * sin_theta,
         py + ahead * sin_theta + left * cos_theta,
@@ -133,6 +138,7 @@ def mount_pose(
         sin_theta * cos_yaw + cos_theta * sin_yaw,
         cos_theta * cos_yaw - sin_theta * sin_yaw,
     )
+    # Right stays horizontal; the pitch tilts the other two columns
     right = mi.Vector3f(sin_theta, -cos_theta, 0)
     down = mi.Vector3f(-cos_theta * sin_pitch, -sin_theta * sin_pitch, -cos_pitch)
     forward = mi.Vector3f(cos_theta * cos_pitch, sin_theta * cos_pitch, -sin_pitch)
@@ -183,19 +189,23 @@ def generate_rays(
         ValueError: the pose arrays do not have n_poses entries.
     """
     n_pixels = camera.width * camera.height
+    # Pose, row and column of each ray, (n_poses * n_pixels,)
     index = dr.arange(mi.UInt32, n_poses * n_pixels)
     pose = index // n_pixels
     pixel = index - pose * n_pixels
     row = pixel // camera.width
     column = pixel - row * camera.width
+    # Position in the image, pixels from the top-left corner
     position = mi.Point2f(column, row) + 0.5
     if subpixel is not None:
         position += subpixel
 
+    # From n_poses entries to one entry per ray; a single entry stays single
     def spread(value: Any) -> Any:
         result = type(value)()
         for i in range(3):
             component = mi.Float(value[i])
+            # A literal would be compiled into the kernel
             if component.state == dr.VarState.Literal:
                 dr.make_opaque(component)
             size = dr.width(component)
@@ -207,6 +217,7 @@ def generate_rays(
             result[i] = component if size == 1 else dr.gather(mi.Float, component, pose)
         return result
 
+    # Now each ray has the pose of its image
     right, down, forward = (spread(mi.Vector3f(c)) for c in rotation)
     lens, origin = Lens([camera]).of(mi.UInt32(0)), spread(mi.Point3f(origin))
     return lens_rays(lens, origin, (right, down, forward), position)

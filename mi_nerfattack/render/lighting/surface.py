@@ -80,10 +80,12 @@ def expected_surface(shape: PosedField, rays: Rays, stop: float) -> Surface:
     Source: appendix A.3 for the depth.
     """
     with dr.suspend_grad():
+        # Depth z = moment / opacity (A.3, normalised), (n,)
         primal = march(shape, rays, stop)
         active = rays.active & (primal.opacity > 0)
         rate = dr.select(active, 1 / primal.opacity, 0)
         depth = dr.select(active, primal.moment * rate, 0)
+        # dz/dmoment = 1 / a, dz/da = -z / a
         by_depth = March(mi.Color3f(0), -depth * rate, rate)
         _, by_rays = march_derivative(
             dr.ADMode.Backward,
@@ -94,8 +96,10 @@ def expected_surface(shape: PosedField, rays: Rays, stop: float) -> Surface:
             stop=stop,
             with_rays=True,
         )
+        # dz/do, (3, n): through the march, and through the face of the box
         slope = by_rays.origin
         slope += rate * _entry_slope(shape, rays, depth, active)
+        # The normal is parallel to dz/do, on the side that the ray comes from
         length = dr.norm(slope)
         clear = (length > 0) & (length < dr.inf) & (primal.opacity > FAINT)
         normal = dr.select(clear, slope / length, -rays.direction)
@@ -109,8 +113,10 @@ def _entry_slope(
 ) -> mi.Vector3f:
     """Differentiate by the origin what the depth owes to the face of the box."""
     o, d = shape.to_local(rays.origin, rays.direction)
+    # Rays that enter the box from outside
     near, far = shape.interval(o, d, rays.t_max)
     entered = active & (near > 0) & (near < far)
+    # Density just inside the face, 1/m; 0 in an empty cell
     inner = o + dr.fma(1e-3, far - near, near) * d
     distance, _ = shape.field.occupancy.query(shape.field.unit(inner), entered)
     density, _ = shape.eval(inner, d, entered & (distance == 0))
@@ -120,6 +126,8 @@ def _entry_slope(
     upper = mi.Vector3f(*map(float, shape.field.upper))
     gap = dr.abs(to_face - dr.select(d > 0, lower, upper)) / (upper - lower)
     is_face = gap == dr.min(gap)
+    # dt_near/do = -1 / d along the normal of the face, else 0
     slope = dr.select(is_face, -1 / dr.select(is_face, d, 1), 0)
     in_world = shape.to_world_gradient(mi.Vector3f(slope), mi.Vector3f(0))[0]
+    # The caller divides by the opacity
     return dr.select(entered, density * (depth - near), 0) * in_world

@@ -102,15 +102,18 @@ class FrameRenderer:
     ) -> None:
         if spp is not None and spp < 1:
             raise InputError(f"spp: {spp}; at least 1")
+        # The scene, with the AOVs of a `field_integrator`, and the sensor
         self.path: Path = Path(path)
         self.scene = load_scene(path, parameters, size_px, layers=True)
         self.sensor = _pick_sensor(path, self.scene, sensor)
         if self.scene.integrator() is None:
             raise InputError(f"{path}: has no integrator; add one, for instance path")
+        # Samples and passes of a frame, and the parameters that move the sensor
         self._spp, self._passes = self._plan(spp)
         self._params: Any = mi.traverse(self.sensor)
         self._names: list[str] | None = None
         self._lens = _describe_camera(self.sensor)
+        # What the metadata of each frame say about its source
         self._digests = {"scene": files.sha256(self.path)}
         for name, file in named_files(self.path, parameters).items():
             self._digests[name] = files.sha256(file)
@@ -199,6 +202,7 @@ class FrameRenderer:
 
     def _channel_names(self, count: int) -> list[str]:
         """Name the channels of the tensor that `mi.render` gives."""
+        # The film stores its colour first, then the AOVs
         aovs = list(self.scene.integrator().aov_names())
         bitmap: Any = self.sensor.film().bitmap()
         stored = [field.name for field in bitmap.struct_()]
@@ -208,12 +212,15 @@ class FrameRenderer:
                 f"{self.path}: the film's pixel_format is xyz; take rgb, rgba, "
                 "luminance or luminance_alpha"
             )
+        # A `field_integrator`: its totals get the names that EXR viewers know
         if set(aovs) >= set(_TOTALS):
             usual = {n: t for n, t in _TOTALS.items() if t not in base}
             aovs = [str(usual.get(name, name)) for name in aovs]
         names = base + aovs
+        # The stock `aov` gives another number of channels than the film stores
         if len(names) != count:
             names = _names_of_aov_integrator(base, aovs)
+        # Each channel must have one name, and each name one channel
         twice = sorted({name for name in names if names.count(name) > 1})
         if len(names) != count or twice:
             raise InputError(
@@ -301,13 +308,16 @@ def _describe_camera(sensor: Any) -> dict[str, Any]:
 
 def _mean(passes: list[np.ndarray], names: list[str]) -> np.ndarray:
     """Average images; depths are weighted by the opacities beside them."""
+    # The plain mean over the passes, of (passes, height, width, channels)
     stack = np.stack(passes).astype(np.float64)
     result = stack.mean(axis=0)
     for i, name in enumerate(names):
+        # The opacity that belongs to a depth; other channels keep the plain mean
         of_all = name == "Z" and "opacity" in names  # where A is the film's alpha
         opacity = "opacity" if of_all else name[:-1] + "A"
         if name.rpartition(".")[2] != "Z" or opacity not in names:
             continue
+        # Mean of depth times opacity, by the mean opacity; infinite where that is 0
         weight = stack[..., names.index(opacity)]
         hit = weight > 0
         moment = np.where(hit, stack[..., i], 0) * weight

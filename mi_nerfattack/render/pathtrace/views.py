@@ -77,6 +77,7 @@ def frame_metadata(
         "digests": dict(sorted(digests.items())),
         **details,
     }
+    # JSON, but text as it is; an entry without a value is left out
     return {
         name: value if isinstance(value, str) else json.dumps(value)
         for name, value in metadata.items()
