@@ -35,29 +35,39 @@ def vary_parts(drives: pd.DataFrame) -> Finding:
     # By which factor the parts differ at a place: one place can decide their order
     spreads = (errors.max() - errors.min()).map(math.exp)
     least, most = spreads.sort_values().iloc[-2:]
+    route = spreads.idxmax()
+    elsewhere = errors.drop(columns=route)
+    without = elsewhere.sub(elsewhere.loc[NONE]).mean(axis=1).map(math.exp).drop(NONE)
     rows = [
         [*place, f"{math.exp(logs.loc[place, NONE]):.3f}"]
         + [f"{math.exp(gain):.2f}" for gain in gains.loc[place]]
         for place in logs.index
     ]
-    best = means.drop(ALL).idxmax()
-    shares = [f"{x:.2f} with `{name}`" for name, x in means.items()]
-    above = [f"`{name}` in {(gains[name] > 0).sum()}" for name in gains.columns]
+    best, pairs = means.drop(ALL).idxmax(), len(logs)
+    above = [f"{(gains[name] > 0).sum()} (`{name}`)" for name in gains.columns]
     return Finding(
-        title=f"{len(places)} places do not show which part of `vary` helps: `{best}` "
-        f"is best, with {means[best]:.2f} times the error",
+        title=f"{len(places)} places cannot show which part of `vary` helps: `{best}` "
+        f"has the largest mean ratio, {means[best]:.2f}",
         sentences=(
-            f"The error in {len(logs)} environments and lights, divided by the error "
-            "of an attack that varies nothing, is "
-            f"{', '.join(shares[:-1])} and {shares[-1]} (geometric mean).",
-            f"The ratio is above 1 for {', '.join(above)} of {len(logs)} rows.",
-            "The mean error over all rows differs between the parts by a factor of "
-            f"{most:.1f} on `{spreads.idxmax()}`, and by at most {least:.1f} on the "
-            "other routes.",
+            "The error of an attack that varies nothing is multiplied by "
+            f"{_listed(means)}, as a geometric mean of {pairs} pairs of environment "
+            "and light.",
+            "The ratio is above 1, so the part makes the attack stronger, in "
+            f"{', '.join(above[:-1])} and {above[-1]} of these pairs.",
+            f"On `{route}`, the geometric mean errors of the parts differ by a factor "
+            f"of {most:.1f}, and on the other routes by at most {least:.1f}. Without "
+            f"`{route}`, the ratios are {_listed(without)}.",
         ),
-        head=["environment", "condition", "nothing (m)", *gains.columns],
+        head=["environment", "condition", "nothing (geometric mean, m)"]
+        + [f"{name} (ratio)" for name in gains.columns],
         rows=rows,
         draw=lambda figure: draw_searches(figure, errors.map(math.exp)),
         pandas="attacks = drives.query(\"case == 'attack'\").copy()\n"
         'print(attacks.groupby(["attack", "environment"]).cross_track_mean_m.mean())',
     )
+
+
+def _listed(ratios: Any) -> str:
+    """Return ratios as words."""
+    *first, last = (f"{x:.2f} (`{name}`)" for name, x in ratios.items())
+    return f"{', '.join(first)} and {last}"

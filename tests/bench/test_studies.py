@@ -239,20 +239,24 @@ def test_the_parts_of_varying_are_compared_with_nothing():
     )
     answer = made("parts", rows)
     assert answer.title.startswith("2 places") and "`camera`" in answer.title
-    assert "2.00 times" in answer.title
+    assert answer.title.endswith("ratio, 2.00")
     factors = ["0.50", "2.00", "1.00", "2.50"]
-    assert answer.head[3:] == ["light", "camera", "vehicle", "all parts"]
+    assert answer.head[3] == "light (ratio)" and len(answer.head) == 7
     assert answer.rows == [
         ["surrogate", "day", "0.200", *factors],
         ["mitsuba", "day", "0.100", *factors],
     ]
-    assert "0.50 with `light`" in answer.sentences[0]
-    assert "`camera` in 2, `vehicle` in 0" in answer.sentences[1]
+    assert "by 0.50 (`light`)" in answer.sentences[0]
+    assert "2 (`camera`), 0 (`vehicle`)" in answer.sentences[1]
     # at one place, the camera's attack is three times as far as in the other rows
     far = rows["attack"].str.startswith("right-cars-camera")
     rows.loc[far, "cross_track_mean_m"] *= 3
-    factors = "by a factor of 12.0 on `right`, and by at most 5.0 on the other"
-    assert factors in made("parts", rows).sentences[2]
+    factors = "by a factor of 12.0, and on the other routes by at most 5.0. Without"
+    sentence = made("parts", rows).sentences[2]
+    assert "On `right`" in sentence and factors in sentence
+    assert sentence.endswith(
+        "2.00 (`camera`), 1.00 (`vehicle`) and 2.50 (`all parts`)."
+    )
 
 
 def test_limits_counts_places_beyond_the_lane():
