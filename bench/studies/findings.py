@@ -29,6 +29,7 @@ from bench.studies.content import (
     interval_words,
     metres,
 )
+from bench.studies.fit_quality import fit_quality
 from bench.studies.light import light
 from bench.studies.limits import limits
 from bench.studies.parts import vary_parts
@@ -368,6 +369,7 @@ FINDINGS: dict[str, tuple[str, Callable[[pd.DataFrame], Finding]]] = {
     "light": ("whether attacks survive other light and wheels", light),
     "parts": ("which part of `vary` helps", vary_parts),
     "limits": ("what limits attacks", limits),
+    "surrogate": ("how good the surrogate must be", fit_quality),
     "country": ("whether the attack works at a second place", country),
 }
 

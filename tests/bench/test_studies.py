@@ -1,28 +1,22 @@
-"""The studies of bench/results.toml: plan, state, runs, checks and findings."""
+"""The studies of bench/results.toml: plan, state, runs and checks."""
 
 from __future__ import annotations
 
 import json
-import math
 
-import numpy as np
 import pandas as pd
 import pytest
-from matplotlib.figure import Figure
+from support.pages.studies import table
 
 from bench.__main__ import main
 from bench.studies import plan, run
-from bench.studies.charts import draw_heat, draw_ratios
-from bench.studies.findings import FINDINGS, finding, is_farther, is_majority
-from bench.studies.pages import FOLDER, page_text, with_answer
+from bench.studies.findings import finding
 from bench.studies.plan import ROOT, Study, read_plan, state
 from mi_nerfattack import cli
-from mi_nerfattack.drives.table import with_starts
-from mi_nerfattack.experiment.sweep.table import COLUMNS, make_table, write_table
+from mi_nerfattack.experiment.sweep.table import COLUMNS, write_table
 from mi_nerfattack.io import files
 
 STUDIES = {study.name: study for study in read_plan().studies}
-PAGES = {s.finding: s for s in STUDIES.values() if s.finding and s.read() is not None}
 GRID = """
 scenario = "bundled:base.toml"
 seeds = [1, 2]
@@ -30,25 +24,6 @@ routes = [{ name = "a", set.scene.route = "left" }, { name = "b" }]
 methods = [{ name = "one" }, { name = "two", set.attack.method.max_iterations = 3 }]
 objects = [{ name = "near", routes = ["b"] }, { name = "far" }]
 """
-
-
-def table(errors: dict[str, list[float]], **labels: str) -> pd.DataFrame:
-    """Return one drive per case and place of a sweep, with these mean errors (m)."""
-    labels = {"method": "gradient", "route": "left", "objects": "car"} | labels
-    rows = [
-        labels
-        | {"cell": f"{labels['method']}{seed}", "seed": seed, "case": case, "run": 0}
-        | {"environment": "surrogate", "frames": 9, "steps": 4, "status": "complete"}
-        | {"cross_track_mean_m": error, "wheel_out_s": 0.0, "departed": error > 1}
-        for case, values in errors.items()
-        for seed, error in enumerate(values)
-    ]
-    return make_table(rows)
-
-
-def drives(*tables: pd.DataFrame) -> pd.DataFrame:
-    rows = with_starts(pd.concat(tables), "cell")
-    return rows.assign(scenario=rows["route"] + ", " + rows["objects"])
 
 
 @pytest.mark.parametrize("study", STUDIES.values(), ids=list(STUDIES))
@@ -60,230 +35,6 @@ def test_studies_name_files_that_exist(study):
     one = state(study, compare=False)
     assert 0 <= one.done <= one.wanted > 0
     assert one.hours_left == pytest.approx((one.wanted - one.done) * study.core_hours)
-
-
-@pytest.mark.parametrize("name", PAGES)
-def test_a_page_is_what_its_table_gives(name):
-    study = PAGES[name]
-    made, picture = finding(study), f"../../pictures/finding_{name}.png"
-    assert made is not None
-    text = page_text(study, made, state(study, compare=False), picture)
-    page = (FOLDER / f"{name}.md").read_text("utf-8")
-    assert page == text, "run python -m bench results --pages"
-    assert 0 < (ROOT / f"docs/pictures/finding_{name}.png").stat().st_size < 100_000
-    assert len(made.sentences) == 3 and len(made.pandas.splitlines()) == 2
-
-
-@pytest.mark.parametrize("name", PAGES)
-def test_the_index_has_the_answer_beside_the_question(name):
-    made = finding(PAGES[name])
-    assert made is not None
-    index = (FOLDER / "index.md").read_text("utf-8")
-    assert with_answer(index, f"{name}.md", made.title) == index
-    assert f"]({name}.md) {made.title}." in " ".join(index.split())
-
-
-def test_only_findings_with_rows_have_a_page():
-    assert {path.stem for path in FOLDER.glob("*.md")} == {*PAGES, "index"}
-
-
-@pytest.mark.parametrize("name", PAGES)
-def test_the_lines_of_pandas_run(name, capsys, monkeypatch):
-    monkeypatch.chdir(ROOT)
-    page = (FOLDER / f"{name}.md").read_text("utf-8")
-    exec(page.partition("```python\n")[2].removesuffix("```\n"), {})
-    assert len(capsys.readouterr().out.splitlines()) > 2
-
-
-def made(name: str, rows: pd.DataFrame):
-    return FINDINGS[name][1](rows)
-
-
-def test_a_side_is_farther_if_wilsons_interval_lies_above_one_half():
-    """All of 6 places: low end 6 / (6 + 1.96²) = 0.61; 5 of 6: 0.44; of 4: unknown."""
-    for errors, expected in (
-        ([0.2] * 6, (6, True)),
-        ([0.2] * 5 + [0.05], (5, False)),
-        ([0.2] * 4, (4, False)),
-    ):
-        other = drives(table({"attack": [0.1] * len(errors)}))
-        assert is_farther(drives(table({"attack": errors})), other) == expected
-
-
-def test_equal_sides_are_seldom_farther_by_chance():
-    """By the binomial distribution, as the page of findings says: 4 % at most."""
-    for places in range(5, 41):
-        majorities = [k for k in range(places + 1) if is_majority(k, places)]
-        ways = sum(math.comb(places, k) for k in majorities)
-        assert 0 < ways / 2**places < 0.04
-
-
-def test_the_attack_is_compared_with_the_worst_random_texture():
-    cases = ("no_object", "random", "best_random", "attack")
-    errors = {case: [0.1 + 0.1 * k] * 6 for k, case in enumerate(cases)}
-    rows = drives(table(errors), table(errors).assign(environment="mitsuba"))
-    answer = made("attack", rows)
-    assert answer.title.endswith("at 6 of 6 places")
-    assert "0.400 m" in answer.sentences[0] and "ratio 1.3" in answer.sentences[0]
-    rows.loc[rows["case"] == "attack", "cross_track_mean_m"] = 0.25
-    assert "not shown" in made("attack", rows).title
-
-
-def test_a_title_claims_nothing_while_attacks_are_missing(study):
-    labels = {"route": "a", "objects": "far", "method": "one"}
-    write(study.folder, table({"attack": [0.1] * 3}, **labels))  # seeds 0, 1, 2
-    answer = finding(study.model_copy(update={"finding": "searches"}))
-    assert answer.title.endswith("best: 2 of 12 attacks exist")
-
-
-def test_the_gradient_is_compared_with_each_search():
-    rows = drives(
-        table({"attack": [0.4] * 6}),
-        table({"attack": [0.2] * 6}, method="random"),
-        table({"attack": [0.5] * 6}, method="blocks"),
-        table({"attack": [0.1] * 6}, method="single_frame"),
-    )
-    cheap = rows["method"] == "single_frame"
-    rows.loc[cheap, "frames"] = 7  # of 9
-    answer = made("gradient", rows)
-    assert "farther than 1 of 2 searches without a gradient" in answer.title
-    assert "0 of 0 other searches" in answer.sentences[0]
-    assert "`single_frame`" in answer.threats[0]
-    assert len(answer.threats) == 1 + 6  # places where `blocks` is better
-    assert [row[3] for row in answer.rows] == ["–", "2.00", "0.80", "4.00"]
-    assert [row[6] for row in answer.rows] == ["–", "0.20 m", "-0.10 m", "0.30 m"]
-    assert "`blocks`" in answer.sentences[1] and "0 to 6 of 6" in answer.sentences[2]
-
-
-def test_transfer_counts_places_not_attacks():
-    """The ratios of all places are almost equal, so their intervals are points."""
-    rows = [
-        {"attack": f"left-{name}-{seed}-0", "environment": where, "condition": "day"}
-        | {"route": "left", "case": case, "cross_track_mean_m": error * (1 + seed)}
-        for where, factor in (("surrogate", 1.0), ("kept", 0.8), ("lost", 0.2))
-        for seed in range(5)
-        for name, change in (("one", 2), ("two", 0.5))
-        for case, error in (
-            ("attack", factor * (change + seed / 1e4 if factor < 1 else 1)),
-            ("no_object", 0.1),
-        )
-    ]
-    answer = made("transfer", pd.DataFrame(rows))
-    assert "in 1 of 2 environments, under half in 1" in answer.title
-    assert "5 places with 10 attacks" in answer.sentences[2]
-    assert answer.rows == [
-        ["kept", "0.80", "0.80 to 0.80", "0.10"],
-        ["lost", "0.20", "0.20 to 0.20", "0.10"],
-    ]
-
-
-def light_rows(methods, where):
-    """Return drives at five places: an environment's share of the surrogate's error."""
-    return pd.DataFrame(
-        {"attack": f"left-cars-{method}-{seed}-0", "route": "left", "case": case}
-        | {"environment": environment, "condition": condition}
-        | {"cross_track_mean_m": error * size * share * (1 + seed / 1e3 * (size > 1))}
-        | {"departed": share > 0.8 and seed > 2}
-        for method, size in methods.items()
-        for (environment, condition), share in where.items()
-        for seed in range(5)
-        for case, error in (("attack", 0.1 + seed), ("no_object", (0.1 + seed) / 4))
-    )
-
-
-def test_light_counts_aims_and_where_varying_helps():
-    where = {("surrogate", "day"): 1.0, ("mitsuba", "day"): 0.88}
-    where |= {("mujoco_built_in", "day"): 0.72, ("mitsuba", "evening"): 0.59}
-    rows = light_rows({"plain": 1.0, "vary": 2.0}, where)
-    answer = made("light", rows)
-    assert "helps attacks in 3 of 3" in answer.title and "aim in 1" in answer.title
-    assert answer.sentences[1].endswith("`plain` reaches the aim in 1 rows.")
-    assert "5 attacks with `vary` and 5 attacks with `plain`" in answer.sentences[0]
-    missed = "misses it in `mitsuba` day, `mitsuba` evening."
-    assert missed in answer.sentences[1] and "in 1 of 3 rows" in answer.sentences[1]
-    by_place = {tuple(row[:2]): row[2:7] for row in answer.rows}
-    assert {place: [row[0], *row[2:]] for place, row in by_place.items()} == {
-        ("mitsuba", "day"): ["0.88", "0.90", "0.88", "0.22"],
-        ("mujoco_built_in", "day"): ["0.72", "0.70", "0.72", "0.18"],
-        ("mitsuba", "evening"): ["0.59", "0.60", "0.59", "0.15"],
-    }
-    for share, ends, *_ in by_place.values():
-        assert ends in (f"{share} to {share}", f"{share} to {float(share) + 0.01:.2f}")
-    assert {row[7] for row in answer.rows} == {"2.00 to 2.01"}
-    threat = answer.threats[-1]
-    assert "leaves the lane at 2 places" in threat and "lane at 2 of them" in threat
-    assert threat.endswith("The attacks at the other 3 places keep 0.72 there.")
-    alone = made("light", rows[rows["attack"].str.contains("vary")])
-    assert "helps attacks in 0 of 3" in alone.title
-    assert "0 attacks with `plain`" in alone.sentences[0]
-    assert {row[7] for row in alone.rows} == {"–"}
-
-
-def test_the_second_place_has_the_rule_of_the_first():
-    cases = ("no_object", "random", "best_random", "attack")
-    errors = {case: [0.1 + 0.1 * k] * 6 for k, case in enumerate(cases)}
-    rows = drives(table(errors), table(errors).assign(environment="mitsuba"))
-    answer = made("country", rows)
-    assert answer.title.startswith("On a country road") and "6 of 6" in answer.title
-
-
-def test_the_parts_of_varying_are_compared_with_nothing():
-    sizes = {"none": 1.0, "light": 0.5, "camera": 2.0, "vehicle": 1.0, "all": 2.5}
-    rows = pd.DataFrame(
-        {"attack": f"{route}-cars-{method}-101-0", "route": route, "case": "attack"}
-        | {"environment": environment, "condition": "day"}
-        | {"cross_track_mean_m": size * share * error}
-        for method, size in sizes.items()
-        for route, error in (("left", 0.1), ("right", 0.4))
-        for environment, share in (("surrogate", 1.0), ("mitsuba", 0.5))
-    )
-    answer = made("parts", rows)
-    assert answer.title.startswith("2 places") and "`camera`" in answer.title
-    assert answer.title.endswith("ratio, 2.00")
-    factors = ["0.50", "2.00", "1.00", "2.50"]
-    assert answer.head[3] == "light (ratio)" and len(answer.head) == 7
-    assert answer.rows == [
-        ["surrogate", "day", "0.200", *factors],
-        ["mitsuba", "day", "0.100", *factors],
-    ]
-    assert "by 0.50 (`light`)" in answer.sentences[0]
-    assert "2 (`camera`), 0 (`vehicle`)" in answer.sentences[1]
-    # at one place, the camera's attack is three times as far as in the other rows
-    far = rows["attack"].str.startswith("right-cars-camera")
-    rows.loc[far, "cross_track_mean_m"] *= 3
-    factors = "by a factor of 12.0, and on the other routes by at most 5.0. Without"
-    sentence = made("parts", rows).sentences[2]
-    assert "On `right`" in sentence and factors in sentence
-    assert sentence.endswith(
-        "2.00 (`camera`), 1.00 (`vehicle`) and 2.50 (`all parts`)."
-    )
-
-
-def test_limits_counts_places_beyond_the_lane():
-    rows = [
-        {"place": f"{route}-{kind}-{seed}", "pixels": 10, "moved": 0.1 * number}
-        | {"original_m": 0.1, "up_m": up, "down_m": 0.2, "limit_m": 0.85}
-        for number, (route, kind, up) in enumerate(
-            [("left", "patch", 0.9), ("left", "billboard", 0.8)], 1
-        )
-        for seed in (1, 2)
-    ]
-    answer = made("limits", pd.DataFrame(rows))
-    assert answer.title.endswith("at 2 of 4 places")
-    assert [row[2] for row in answer.rows] == ["2/2", "0/2"]
-    assert "a patch on the route `left`" in answer.sentences[1]
-    assert "0.10 rad/s" in answer.sentences[1]
-
-
-def test_charts_draw_ratios_intervals_and_heat():
-    draw_ratios(figure := Figure(), {"a": (2.0, [1.5, 3.0]), "b": (0.5, None)})
-    lines = [line.get_xdata() for line in figure.axes[0].lines]
-    assert [list(x) for x in lines[:4]] == [[1.5, 3.0], [2.0], [0.5, 0.5], [0.5]]
-    heat = pd.DataFrame([[1.0, np.nan]], ["surrogate"], ["day", "noon"])
-    draw_heat(figure := Figure(), heat)
-    (image,) = figure.axes[0].images
-    assert image.get_array().filled(-1).tolist() == [[1.0, -1.0]]
-    assert [text.get_text() for text in figure.axes[0].texts] == ["1.0"]
 
 
 def test_a_check_draws_whole_cells_until_a_tenth_of_the_rows():
@@ -313,6 +64,13 @@ def write(folder, rows):
     records = plain.where(plain.notna(), None).to_dict("records")
     cell = {"digests": {}, "versions": None, "scenario": ""}
     write_table(files.make_folder(folder), records, dict.fromkeys(rows["cell"], cell))
+
+
+def test_a_title_claims_nothing_while_attacks_are_missing(study):
+    labels = {"route": "a", "objects": "far", "method": "one"}
+    write(study.folder, table({"attack": [0.1] * 3}, **labels))  # seeds 0, 1, 2
+    answer = finding(study.model_copy(update={"finding": "searches"}))
+    assert answer.title.endswith("best: 2 of 12 attacks exist")
 
 
 def test_a_table_is_never_replaced_by_one_with_fewer_attacks(study, capsys):

@@ -1,0 +1,120 @@
+"""The finding about the quality of the surrogate: attacks in good and poor fields."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bench.studies.charts import draw_ratios
+from bench.studies.content import ERROR, Finding, ends_cell, interval_words
+from bench.studies.plan import ROOT
+from mi_nerfattack.evaluation.summary import Interval, interval
+from mi_nerfattack.io import files
+from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT
+from mi_nerfattack.scenario.deployment import SURROGATE
+
+FIELDS = ROOT / "bench/fit_quality/fields"
+#: The method that attacks in the bundled field.
+BEST = "steps_12000"
+
+
+def fit_quality(
+    drives: pd.DataFrame, psnr: Mapping[str, float] | None = None
+) -> Finding:
+    """Compare attacks in each field with those in the bundled one, in the deployment.
+
+    Args:
+        drives: of the grid bench/fit_quality.toml; a method is a field.
+        psnr: by method, dB; by default the mean over the routes of `FIELDS`.
+    """
+    where = next(name for name in drives["environment"].unique() if name != SURROGATE)
+    inside, deployed = (
+        _errors(drives, environment, ATTACK) for environment in (SURROGATE, where)
+    )
+    bare = _errors(drives, SURROGATE, NO_OBJECT)
+    names = list(deployed.index)
+    psnr = {name: _psnr(name) for name in names} if psnr is None else psnr
+    logs = deployed.map(math.log)
+    transfer, gains = logs - inside.map(math.log), logs - logs.loc[BEST]
+    ratios = {name: _mean(gains.loc[name]) for name in names if name != BEST}
+    poor = [n for n, (_, ends) in ratios.items() if ends is not None and ends[1] < 1]
+    worst = min(ratios, key=lambda name: psnr[name])
+    title = (
+        f"Attacks from {len(poor)} of {len(ratios)} poorer fields are weaker in the "
+        f"path-traced scene: {ratios[worst][0]:.2f} times at {psnr[worst]:.1f} dB"
+    )
+    if not poor:
+        title = (
+            "No poorer field is shown to make weaker attacks: at "
+            f"{psnr[worst]:.1f} dB, {ratios[worst][0]:.2f} times the error"
+        )
+    rows = [
+        [
+            *(f"`{name}`", f"{psnr[name]:.1f}"),
+            *(f"{errors.loc[name].mean():.3f}" for errors in (bare, inside, deployed)),
+            f"{_mean(transfer.loc[name])[0]:.2f}",
+            *_cells(ratios.get(name)),
+        ]
+        for name in names
+    ]
+    shares = ", ".join(f"{_mean(transfer.loc[n])[0]:.2f} (`{n}`)" for n in names)
+    listed = ", ".join(f"`{name}`" for name in poor) or "none of them"
+    return Finding(
+        title=title,
+        sentences=(
+            f"In the path-traced scene, attacks from `{worst}` have "
+            f"{ratios[worst][0]:.2f} times the error of attacks from `{BEST}` "
+            f"({deployed.shape[1]} places, geometric mean, "
+            f"{interval_words(ratios[worst][1], 2)}).",
+            f"The error there, divided by the error in the field, is {shares}.",
+            "A field is too poor if the interval of its ratio lies below 1. This holds "
+            f"for {listed}.",
+        ),
+        head=[
+            *("field", "PSNR along the routes (dB)", "no object, in the field (m)"),
+            *("attack, in the field (m)", f"attack, `{where}` (m)"),
+            f"`{where}` to field (geometric mean)",
+            *(f"`{where}`, ratio to `{BEST}` (geometric mean)", "95 % interval"),
+        ],
+        rows=rows,
+        draw=lambda figure: draw_ratios(
+            figure, {f"{n}, {psnr[n]:.1f} dB": ratio for n, ratio in ratios.items()}
+        ),
+        pandas="attacks = drives.query(\"case == 'attack'\")\n"
+        'print(attacks.pivot_table("cross_track_mean_m", "method", "environment"))',
+        threats=(
+            "An interval that contains 1 does not show that two fields are equally "
+            "good.",
+            "All fields are from the same 384 views with depth. A field from fewer "
+            "views has other faults.",
+        ),
+    )
+
+
+def _errors(drives: pd.DataFrame, environment: str, case: str) -> pd.DataFrame:
+    """Return the mean error (m) by method and place."""
+    own = drives[(drives["environment"] == environment) & (drives["case"] == case)]
+    return own.pivot_table(ERROR, "method", ["route", "seed"], sort=False)
+
+
+def _mean(logs: Any) -> tuple[float, Interval]:
+    """Return the geometric mean of the places that exist, and its interval."""
+    known = logs.dropna().to_numpy()
+    ends = interval(np.mean, (known,), 0)
+    mean = math.exp(known.mean())
+    return mean, None if ends is None else np.exp(ends).tolist()
+
+
+def _cells(ratio: tuple[float, Interval] | None) -> list[str]:
+    """Return a ratio and its interval as cells; of the bundled field, itself."""
+    return ["1", "–"] if ratio is None else [f"{ratio[0]:.2f}", ends_cell(ratio[1], 2)]
+
+
+def _psnr(method: str) -> float:
+    """Return the mean PSNR of a field's frames along the routes, dB."""
+    routes = files.read_json(FIELDS / method / "metrics.json")["routes"].values()
+    return sum(route["psnr_mean_db"] for route in routes) / len(routes)
