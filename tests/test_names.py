@@ -45,17 +45,29 @@ def defined(tree: ast.AST) -> Iterator[str]:
                 yield name
 
 
+def assigned(target: ast.AST, value: ast.AST) -> Iterator[tuple[ast.AST, ast.AST]]:
+    """Yield what gets which value, also inside of ``a, b = x, y``."""
+    yield target, value
+    if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple):
+        for one, part in zip(target.elts, value.elts, strict=False):
+            yield from assigned(one, part)
+
+
 def splatted(tree: ast.AST) -> Iterator[str]:
     """Yield calls ``f(*name)`` of a tuple that the same function has built."""
     for function in ast.walk(tree):
         if isinstance(function, ast.FunctionDef):
             nodes = list(ast.walk(function))
-            tuples = {
-                node.targets[0].id
+            pairs = [
+                pair
                 for node in nodes
                 if isinstance(node, ast.Assign)
-                and isinstance(node.value, ast.Tuple)
-                and isinstance(node.targets[0], ast.Name)
+                for pair in assigned(node.targets[0], node.value)
+            ]
+            tuples = {
+                target.id
+                for target, value in pairs
+                if isinstance(target, ast.Name) and isinstance(value, ast.Tuple)
             }
             for call in nodes:
                 for argument in call.args if isinstance(call, ast.Call) else ():
@@ -105,5 +117,6 @@ def test_the_walk_sees(source, names, tmp_path):
 
 
 def test_the_walk_sees_splats():
-    source = "def f():\n    pair = 1, 2\n    g(*pair, 3)\n    h(*others)"
-    assert list(splatted(ast.parse(source))) == ["g(*pair, 3)"]
+    source = "def f():\n    pair, n = (1, 2), 3\n    g(*pair, n)\n    h(*others)"
+    assert list(splatted(ast.parse(source))) == ["g(*pair, n)"]
+    assert list(splatted(ast.parse(source.replace(", n = (1, 2), 3", " = 1, 2"))))

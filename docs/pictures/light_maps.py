@@ -76,8 +76,8 @@ class Subject:
         rays = Rays(*generate_rays(self.camera, *pose_arrays(self.pose), 1))
         gain = Gain(mi.Color3f(1), mi.UInt32(row))
         marched = march(self.posed.with_gain(gain), rays)
-        colour, shape = marched.radiance.numpy().T, (self.size, self.size)
-        return colour.reshape(*shape, 3), marched.opacity.numpy().reshape(shape)
+        colour, opacity, n = marched.radiance.numpy().T, marched.opacity, self.size
+        return colour.reshape(n, n, 3), opacity.numpy().reshape(n, n)
 
     def relit(self, emitters: dict[str, Any]) -> np.ndarray:
         """Render the field `relit`, linear (h, w, 3)."""
