@@ -57,7 +57,7 @@ class BenchAccuracy(Comparison):
 
     def run(self) -> Result:
         """Measure, print and write."""
-        return compare("accuracy", self, measure, lines)
+        return compare("accuracy", self, measure, lines=lines)
 
 
 def measure(options: BenchAccuracy, folder: Path, show: Progress) -> dict[str, Any]:
@@ -84,7 +84,7 @@ def _steps(
     for view, (name, eye, target, angle) in VIEWS.items():
         field = load_field(bundled(f"{name}/field.safetensors"))
         own, composite = field.step_m, DepthComposite()
-        rays = _rays(width, height, angle, look_at(eye, target))
+        rays = _rays(width, height, angle, pose=look_at(eye, target))
         field.refine(own / FINEST[name])
         posed = PosedField(field)  # reads the step
         exact = _picture(composite.render([posed], rays, 0.0), [posed], rays)

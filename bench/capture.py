@@ -150,7 +150,12 @@ def write_photographs(original: PosedImages, work: Path) -> None:
     cameras = [original.camera_of(i) for i in range(len(original))]
     stored = [f"../posed/images/{name}" for name in names]  # upright, if placed
     files.make_folder(work / "given")
-    write_poses(work / "given" / TRANSFORMS, stored, cameras, original.camera_to_world)
+    write_poses(
+        work / "given" / TRANSFORMS,
+        stored,
+        cameras,
+        camera_to_world=original.camera_to_world,
+    )
 
 
 def pose_errors(
@@ -201,7 +206,7 @@ def thinned(options: BenchGaps, every: int) -> dict[str, Any]:
     fitted[np.delete(indices, held_out(len(indices)))] = True
     assert images.points is not None
     cameras = [images.camera_of(i) for i in range(len(images))]
-    gaps = view_gaps(cameras, images.camera_to_world, images.points, fitted)
+    gaps = view_gaps(cameras, images.camera_to_world, images.points, others=fitted)
     renderer, scores = FieldRenderer(load_field(output)), []
     for i in np.flatnonzero(~fitted).tolist():
         shown = renderer.render(cameras[i], images.camera_to_world[i]).image

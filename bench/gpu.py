@@ -230,7 +230,7 @@ def _sensor(job: Job) -> SceneSensor:
     scene = PosedField(load_field(bundled("intersection/field.safetensors")))
     hydrant = load_grid(bundled("hydrant/field.safetensors"))
     items = [PosedField(hydrant, pose) for pose in job.object_poses()]
-    return field_sensor(scene, items, job.camera, MOUNT, stop=STOP)
+    return field_sensor(scene, items, job.camera, mount=MOUNT, stop=STOP)
 
 
 def _row(sensor: SceneSensor, state: Any, repeats: int) -> dict[str, float]:

@@ -47,7 +47,7 @@ class BenchSplats(Comparison):
     def run(self) -> Result:
         """Measure, print and write."""
         read_sizes(self.sizes)
-        return compare("splats", self, measure, lines)
+        return compare("splats", self, measure, lines=lines)
 
 
 def measure(options: BenchSplats, folder: Path, show: Progress) -> dict[str, Any]:

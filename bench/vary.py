@@ -45,7 +45,7 @@ class BenchVary(Comparison):
 
     def run(self) -> Result:
         """Measure, print and write."""
-        return compare("vary", self, measure, lines)
+        return compare("vary", self, measure, lines=lines)
 
 
 def measure(options: BenchVary, folder: Path, show: Progress) -> dict[str, Any]:

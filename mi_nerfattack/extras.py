@@ -99,4 +99,4 @@ def load_extra(module: str, purpose: str, otherwise: str = "") -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise missing(module, purpose, error, otherwise) from error
+        raise missing(module, purpose, error, otherwise=otherwise) from error

@@ -41,7 +41,7 @@ class RayCollector:
     def add(self, rays: Rays, primal: Marches, cotangent: Marches) -> None:
         """Take rays; see :meth:`AbstractComposite.backward`."""
         composite, posed, _ = self._arguments
-        for task in composite.tasks(posed, rays, primal, cotangent):
+        for task in composite.tasks(posed, rays, primal, cotangent=cotangent):
             for ready in self._queue.add(task):
                 self._launch(ready)
         if not self.waits:

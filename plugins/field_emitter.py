@@ -128,9 +128,11 @@ class FieldEmitter(mi.Emitter):
         inside = dr.dot(direction, si.n) > 0
         origin = dr.select(inside, si.p - si.t * direction, si.p)
         t_max = dr.select(inside, si.t, dr.inf)
-        rays = Rays(origin, direction, t_max, mi.Float(0.5), mi.Bool(active))
+        rays = Rays(
+            origin, direction, t_max, jitter=mi.Float(0.5), active=mi.Bool(active)
+        )
         posed = [volume.posed for volume in self.volumes]
-        radiance, opacity = attached(self.composite, posed, rays, self.stop)
+        radiance, opacity = attached(self.composite, posed, rays, stop=self.stop)
         radiance += (1 - opacity) * background(self.volumes, direction)
         return spectrum.emission(radiance, si.wavelengths) & active
 

@@ -59,7 +59,7 @@ class FilmIntegrator(mi.ad.integrators.common.RBIntegrator):
         """Render the image with its AOVs; see ``mi.render``."""
         del develop, evaluate
         with dr.suspend_grad():
-            view = _View(self, scene, sensor, seed, spp)
+            view = _View(self, scene, sensor, seed=seed, spp=spp)
             colour, state = view.trace(view.sampler)
             return view.develop(colour, *self.splats(state))
 
@@ -75,7 +75,7 @@ class FilmIntegrator(mi.ad.integrators.common.RBIntegrator):
         """Accumulate gradients; see ``mi.render``."""
         del params
         with self.differentiating(scene, dr.ADMode.Backward), dr.suspend_grad():
-            view = _View(self, scene, sensor, seed, spp)
+            view = _View(self, scene, sensor, seed=seed, spp=spp)
             colour, state = view.trace(view.sampler.clone())
             alpha, aovs = self.splats(state)
             # Film and division, by automatic differentiation
@@ -89,7 +89,9 @@ class FilmIntegrator(mi.ad.integrators.common.RBIntegrator):
                 δL, *δsplats = dr.grad(leaves)
             view.film.clear()
             # Fields, nested integrator and camera
-            view.trace(view.sampler, dr.ADMode.Backward, δL, δsplats, state)
+            view.trace(
+                view.sampler, dr.ADMode.Backward, δL, δsplats=δsplats, state_in=state
+            )
 
     def render_forward(
         self,
@@ -102,7 +104,7 @@ class FilmIntegrator(mi.ad.integrators.common.RBIntegrator):
         """Render the image's tangent; see ``mi.render``."""
         del params
         with self.differentiating(scene, dr.ADMode.Forward), dr.suspend_grad():
-            view = _View(self, scene, sensor, seed, spp)
+            view = _View(self, scene, sensor, seed=seed, spp=spp)
             colour, state = view.trace(view.sampler.clone())
             alpha, aovs = self.splats(state)
             tangent, t_splats = view.trace(
@@ -168,7 +170,7 @@ class _View:
         """Splat rays and divide by their weights; differentiable."""
         block = self.film.create_block()
         block.set_coalesce(block.coalesce() and self.spp >= 4)
-        block.put(self.position, self._channels(block, colour, alpha, aovs))
+        block.put(self.position, self._channels(block, colour, alpha, aovs=aovs))
         self.film.put_block(block)
         return self.integrator.developed(self.film.develop())
 

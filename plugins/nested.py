@@ -110,7 +110,9 @@ def look(
         active=rays.active,
     )
     if light is not None:
-        shadow = light.behind(scene, sampler, integrator.posed, ray, rays.active)
+        shadow = light.behind(
+            scene, sampler, integrator.posed, ray=ray, active=rays.active
+        )
         behind *= spectrum.reflectance(shadow, ray.wavelengths)
     return State(marches, rays.gains, behind, valid, list(aovs), *inner)
 
@@ -198,7 +200,9 @@ def push_forward(
             dr.set_grad(layer, part)
         if t_behind is not None:
             dr.set_grad(leaf.behind, t_behind)
-        colour = lay_over(integrator, leaf.marches.total, rays, leaf.behind, ray)
+        colour = lay_over(
+            integrator, leaf.marches.total, rays, behind=leaf.behind, ray=ray
+        )
         outputs = colour, *integrator.splats(leaf)
         flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
         colour, alpha, aovs = dr.forward_to(outputs, flags=flags)

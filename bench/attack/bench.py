@@ -52,7 +52,7 @@ class BenchAttack(Comparison):
     def run(self) -> Result:
         """Measure, print and write."""
         read_sizes(self.sizes)
-        return compare("attack", self, measure, lines)
+        return compare("attack", self, measure, lines=lines)
 
 
 def measure(options: BenchAttack, folder: Path, show: Progress) -> dict[str, Any]:
@@ -74,7 +74,7 @@ def measure(options: BenchAttack, folder: Path, show: Progress) -> dict[str, Any
     for text, size in zip(options.sizes, sizes, strict=True):
         job = Job(*size, 1, horizon)
         peer = [str(scene), str(item), astuple(job), *[[4096]] * options.quick]
-        rows[text] = _times(job, str(bricks), peer, options.repeats, show)
+        rows[text] = _times(job, str(bricks), peer, repeats=options.repeats, show=show)
     return {"horizon": horizon, "repeats": options.repeats, "sizes": rows}
 
 

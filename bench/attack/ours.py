@@ -64,7 +64,9 @@ class OurAttack:
         hydrant = bundled("hydrant/field.safetensors")
         items = [PosedField(load_grid(hydrant), pose) for pose in job.object_poses()]
         field = load_field(scene or bundled("intersection/field.safetensors"))
-        sensor = field_sensor(PosedField(field), items, job.camera, MOUNT, stop=STOP)
+        sensor = field_sensor(
+            PosedField(field), items, job.camera, mount=MOUNT, stop=STOP
+        )
         policy = TorchPolicy(network(), preprocess=Preprocess(job.transforms()))
         path = route()
         vehicle = Dubins(SPEED_MS, MAX_HEADING_RATE)

@@ -55,7 +55,7 @@ class TorchAttack:
         self.item = TorchObject(ObjectData.read(Path(item)), STOP)
         self.item.texture.requires_grad_(True)
         camera = TorchCamera(job.camera, MOUNT)
-        self.view = TorchView(ngp, self.item, camera, chunks[0])
+        self.view = TorchView(ngp, self.item, camera, chunk=chunks[0])
         path = route()
         self.loop = TorchLoop(
             self.view,

@@ -81,7 +81,7 @@ class BenchFit(Comparison):
 
     def run(self) -> Result:
         """Measure, print and write."""
-        return compare("fit", self, measure, lines)
+        return compare("fit", self, measure, lines=lines)
 
 
 def measure(options: BenchFit, root: Path, show: Progress) -> dict[str, Any]:
@@ -91,8 +91,8 @@ def measure(options: BenchFit, root: Path, show: Progress) -> dict[str, Any]:
         bundled("intersection/scene.xml"),
         bundled("intersection/routes.json"),
         root / "views",
-        sizes.views,
-        from_fov(sizes.width, sizes.height, 90.0),
+        n=sizes.views,
+        camera=from_fov(sizes.width, sizes.height, 90.0),
         spp=4,
         seed=1,
         progress=lambda done, total: show("views", done, total, ""),

@@ -57,7 +57,7 @@ class BenchLoop:
             for done, (way, policy) in enumerate(pairs):
                 remark = f"{WAYS[way]}, {POLICIES[policy]}".replace("`", "")
                 show("closed-loop gradient", done, len(pairs), remark)
-                figures = measure(self, size, way, policy, path)
+                figures = measure(self, size, way, policy=policy, path=path)
                 rows.append({"way": way, "policy": policy, **figures})
                 gradients.append(np.load(path).astype(np.float64))
         document = {

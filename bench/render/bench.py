@@ -41,7 +41,7 @@ class BenchRender(Comparison):
     def run(self) -> Result:
         """Measure, print and write."""
         read_sizes(self.sizes)
-        return compare("render", self, measure, lines)
+        return compare("render", self, measure, lines=lines)
 
 
 def measure(options: BenchRender, folder: Path, show: Progress) -> dict[str, Any]:
@@ -54,7 +54,7 @@ def measure(options: BenchRender, folder: Path, show: Progress) -> dict[str, Any
     path = folder / "field.safetensors"
     data.write(path)
     for text, size in zip(options.sizes, sizes, strict=True):
-        document["sizes"][text] = _compare(options, str(path), size, show)
+        document["sizes"][text] = _compare(options, str(path), size, show=show)
     late = sum(row.pop("compiled") for row in document["sizes"].values())
     return document | {
         "kernels_compiled_after_warmup": late,

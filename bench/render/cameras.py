@@ -20,7 +20,7 @@ def route_rays(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     """
     route = Route.from_file(bundled("intersection/routes.json"), "straight")
     pose = mount_matrix(route.pose_at(0.0), CameraMount())[0]
-    return pinhole_rays(width, height, FOV_DEG, pose)
+    return pinhole_rays(width, height, FOV_DEG, camera_to_world=pose)
 
 
 def pinhole_rays(

@@ -55,7 +55,7 @@ class OurSide:
             mi.Point3f(origin.T.tolist()),
             mi.Vector3f(direction.T.tolist()),
             dr.opaque(mi.Float, dr.inf),
-            dr.opaque(mi.Float, 0.5),
+            jitter=dr.opaque(mi.Float, 0.5),
         )
         dr.eval(rays)
         return rays

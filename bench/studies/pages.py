@@ -46,7 +46,9 @@ def write_pages(
                 files.write_bytes(chart, _smaller(png(figure)))
             page = files.make_folder(folder) / f"{study.finding}.md"
             one = state(study, compare=False)
-            files.write_text(page, page_text(study, made, one, relpath(chart, folder)))
+            files.write_text(
+                page, page_text(study, made, one, picture=relpath(chart, folder))
+            )
             written.append(page)
             index = folder / "index.md"
             if index.exists():

@@ -151,7 +151,7 @@ class BenchResults:
             try:
                 row = _check_row(self._repeated(study, table), len(table), self.seed)
             except InputError as err:
-                rows[study.name] = _check_row([], len(table), self.seed, str(err))
+                rows[study.name] = _check_row([], len(table), self.seed, error=str(err))
                 continue
             rows[study.name] = row
             document = stamp(row, command_of("results", self))

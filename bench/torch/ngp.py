@@ -167,7 +167,9 @@ class TorchNGP:
         colour = self._colour(h[lit], harmonics[ray])
         self.evaluated += len(lit)
         weight = torch.exp(-before) * -torch.expm1(-x)
-        return Lit(ray, x, weight, colour, samples.distance[chosen][lit])
+        return Lit(
+            ray, x, weight, colour=colour, distance=samples.distance[chosen][lit]
+        )
 
     def samples(
         self,
@@ -193,7 +195,9 @@ class TorchNGP:
         start = torch.maximum(edges[:-1], near[:, None])  # (rays, intervals)
         end = torch.minimum(edges[1:], far[:, None])
         t = torch.lerp(start, end, 0.5 if jitter is None else jitter[:, None])
-        return occupied_samples(self.occupied, (start_unit, slope), t, end - start)
+        return occupied_samples(
+            self.occupied, (start_unit, slope), t, width=end - start
+        )
 
     def _lattice(self, index: torch.Tensor) -> torch.Tensor:
         """Return the distance of lattice points, metres."""

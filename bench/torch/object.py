@@ -169,7 +169,7 @@ class TorchObject:
         colour = decode(lookup(self.texture, lit.row, lit.corner))
         radiance = torch.zeros(len(lit.met), 3)
         radiance = radiance.index_add(0, lit.ray, lit.weight[:, None] * colour)
-        return ObjectView(lit.met, radiance, torch.exp(-lit.depth), lit.moment)
+        return ObjectView(lit.met, radiance, torch.exp(-lit.depth), moment=lit.moment)
 
     def _lit(self, origin: torch.Tensor, direction: torch.Tensor) -> _Lit:
         """Find the samples in front of the ends of their rays, and their weights."""
@@ -201,7 +201,7 @@ class TorchObject:
             torch.cat(some) for some in zip(*batches, strict=True)
         )
         self.evaluated += len(ray)
-        return _Lit(met, depth, moment, ray, row, corner, weight)
+        return _Lit(met, depth, moment, ray=ray, row=row, corner=corner, weight=weight)
 
     def _samples(
         self, origin: torch.Tensor, direction: torch.Tensor
@@ -224,7 +224,7 @@ class TorchObject:
         begin = torch.maximum(index * self.step, near[:, None])
         end = torch.minimum((index + 1) * self.step, far[:, None])
         rays, t = (start, slope), 0.5 * (begin + end)
-        samples = occupied_samples(self.cells, rays, t, end - begin)
+        samples = occupied_samples(self.cells, rays, t, width=end - begin)
         met, samples.ray = torch.unique_consecutive(samples.ray, return_inverse=True)
         return through[met], samples
 

@@ -43,7 +43,12 @@ def view_gaps(
     eyes = camera_to_world[:, :3, 3]
     shown = points_shown(cameras, camera_to_world, points)
     usable = np.ones(len(cameras), bool) if others is None else others
-    return np.array([_gap(i, eyes, shown, usable, points) for i in range(len(cameras))])
+    return np.array(
+        [
+            _gap(i, eyes, shown, usable=usable, points=points)
+            for i in range(len(cameras))
+        ]
+    )
 
 
 def nearest_points(

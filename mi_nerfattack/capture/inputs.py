@@ -69,10 +69,14 @@ def read_depth(folder: str | Path, images: PosedImages) -> np.ndarray | None:
     table, frames = read_table(source)
     used = _frames_of(source, frames, images)
     if table.get("depth_file") is not None:
-        return _read_own(source, table["depth_file"], len(frames), used, images)
+        return _read_own(
+            source, table["depth_file"], len(frames), used=used, images=images
+        )
     if any(frames[i].get("depth_file_path") is not None for i in used):
         maps = [
-            _read_axial(source, i, frames[i].get("depth_file_path"), images, k)
+            _read_axial(
+                source, i, frames[i].get("depth_file_path"), images=images, index=k
+            )
             for k, i in enumerate(used)
         ]
         return stacked(maps)

@@ -51,7 +51,7 @@ def read_cameras(
             _check_first_size(where, values, image_shape)
         key = (is_fisheye, *values.values())
         if key not in known:
-            known[key] = _camera(where, values, image_shape, is_fisheye)
+            known[key] = _camera(where, values, image_shape, is_fisheye=is_fisheye)
         cameras.append(known[key])
     return tuple(cameras)
 
@@ -113,9 +113,9 @@ def _camera(
     image_shape: tuple[int, ...],
     is_fisheye: bool,
 ) -> Camera:
-    width = _size(where, "w", values["w"], image_shape[1])
-    height = _size(where, "h", values["h"], image_shape[0])
-    fl_x, fl_y = _focal_lengths(where, values, width, height)
+    width = _size(where, "w", values["w"], default=image_shape[1])
+    height = _size(where, "h", values["h"], default=image_shape[0])
+    fl_x, fl_y = _focal_lengths(where, values, width, height=height)
     try:
         return Camera(
             width,

@@ -92,7 +92,7 @@ def render_asset(
     reach = 0.5 * float(np.linalg.norm(high - low))
     distance = _MARGIN * reach / math.sin(math.radians(0.5 * _FOV_DEG))
     camera = from_fov(size_px, size_px, _FOV_DEG)
-    poses = sphere_poses(n_views, 0.5 * (low + high), distance, seed)
+    poses = sphere_poses(n_views, 0.5 * (low + high), distance, seed=seed)
     light = Lighting() if lighting is None else lighting
     scene = mi.load_dict(
         {"type": "scene", "light": light.emitter(), **mitsuba_shapes(mesh)},
@@ -112,7 +112,7 @@ def render_asset(
         depth[i] = view.depth if is_solid else _solid_depth(scene, camera, poses[i])
         progress(i + 1, n_views)
     names = tuple(f"{mesh.name}:{i:04d}" for i in range(n_views))
-    return PosedImages(images, poses, camera, names), depth
+    return PosedImages(images, poses, camera, names=names), depth
 
 
 def _solid_depth(scene: Any, camera: Camera, pose: np.ndarray) -> np.ndarray:

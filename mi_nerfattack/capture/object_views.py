@@ -91,10 +91,10 @@ def render_views(
 ) -> ObjectViews:
     """Render a placed mesh; see `render_asset`."""
     images, depth = render_asset(
-        mesh, n_views, size_px, seed, lighting, progress=progress
+        mesh, n_views, size_px, seed=seed, lighting=lighting, progress=progress
     )
     lower, upper = mesh.bounds
-    return ObjectViews(images, lower, upper, depth)
+    return ObjectViews(images, lower, upper, depth=depth)
 
 
 def read_views(
@@ -133,10 +133,10 @@ def read_views(
     images = move_views(images, matrix, scale=1.0, offset=np.zeros(3))
     lower, upper = silhouette_bounds(images)
     scale = extent_scale(
-        str(folder), upper - lower, placement.height_m, placement.longest_m
+        str(folder), upper - lower, placement.height_m, longest_m=placement.longest_m
     )
     base = np.array([*(0.5 * (lower + upper)[:2]), lower[2]])
-    images = move_views(images, np.eye(3), scale, -scale * base)
+    images = move_views(images, np.eye(3), scale, offset=-scale * base)
     if (placement.height_m, placement.longest_m) != (None, None):
         images = replace(images, unit="metre")
     return ObjectViews(

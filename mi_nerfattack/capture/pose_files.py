@@ -77,7 +77,7 @@ def read_poses(
         rows = table.get("frames")
         if not isinstance(rows, list) or not all(isinstance(r, dict) for r in rows):
             raise InputError(f"{path}: frames: needs a [[frames]] table per frame")
-        return _from_rows(path, rows, mount, _camera(path, table.get("camera")))
+        return _from_rows(path, rows, mount, camera=_camera(path, table.get("camera")))
     raise InputError(f"{path}: not a pose file; use {', '.join(SUFFIXES)}")
 
 
@@ -93,7 +93,7 @@ def _read_json(path: Path, image_shape: tuple[int, ...] | None) -> PoseTable:
     poses = read_frames(path, numbered)
     camera = None
     if image_shape is not None:
-        cameras = set(read_cameras(path, table, numbered, image_shape))
+        cameras = set(read_cameras(path, table, numbered, image_shape=image_shape))
         if len(cameras) > 1:
             raise InputError(
                 f"{path}: {len(cameras)} cameras; a drive is recorded by one"
@@ -151,7 +151,9 @@ def _from_rows(
             )
     require_near(path, np.stack(poses)[:, :3, 3])
     names = _names(path, rows, "file")
-    return PoseTable(path, np.stack(poses), _times(path, rows), names, camera)
+    return PoseTable(
+        path, np.stack(poses), _times(path, rows), names=names, camera=camera
+    )
 
 
 def pose_matrix(

@@ -102,7 +102,9 @@ def drive_poses(
     pitch = mount.pitch_deg + is_other * rng.normal(0, _PITCH_SD_DEG, n)
     poses = []
     for i in range(n):
-        state = _scattered(routes[i % len(routes)], along[i], lateral[i], heading[i])
+        state = _scattered(
+            routes[i % len(routes)], along[i], lateral[i], heading=heading[i]
+        )
         drawn_mount = replace(
             mount, height_m=float(height[i]), pitch_deg=float(pitch[i])
         )
@@ -143,7 +145,7 @@ def _free_poses(
     scene: Any, routes: Sequence[Route], n: int, seed: int, mount: CameraMount | None
 ) -> np.ndarray:
     """Draw poses; those from which something hides the lane's middle, anew."""
-    poses, turn = drive_poses(routes, n, seed, mount), 0
+    poses, turn = drive_poses(routes, n, seed, mount=mount), 0
     while (hidden := _is_hidden(scene, routes, poses)).any():
         turn += 1
         if turn > _ROUNDS:
@@ -151,7 +153,7 @@ def _free_poses(
                 f"views: {hidden.sum()} of {n} are within things that stand beside the "
                 "lane; is the mount of the camera that of the car?"
             )
-        poses[hidden] = drive_poses(routes, n, seed + turn, mount)[hidden]
+        poses[hidden] = drive_poses(routes, n, seed + turn, mount=mount)[hidden]
     return poses
 
 
@@ -219,12 +221,20 @@ def capture_scene(
         progress(n, n)
         return path
     scene = load_scene(scene_path)
-    _check(scene, Path(scene_path), routes, routes_path)
-    poses = _free_poses(scene, routes, n, seed, mount)
+    _check(scene, Path(scene_path), routes, source=routes_path)
+    poses = _free_poses(scene, routes, n, seed=seed, mount=mount)
     begin_posed(out_folder)
-    names = _write_views(root, scene, camera, poses, drawn, identity, progress)
+    names = _write_views(
+        root,
+        scene,
+        camera,
+        poses=poses,
+        drawn=drawn,
+        identity=identity,
+        progress=progress,
+    )
     extra = {"units": "metre", "depth_file": _DEPTH, **drawn, _IDENTITY: identity}
-    write_poses(path, names, camera, poses, extra)
+    write_poses(path, names, camera, camera_to_world=poses, extra=extra)
     shutil.rmtree(root / _VIEWS, ignore_errors=True)
     return path
 
@@ -245,8 +255,10 @@ def _write_views(
     folder = files.make_folder(root / _VIEWS)
     for i, view_seed in enumerate(view_seeds(drawn["seed"], n)):
         file = folder / f"{i:04d}.safetensors"
-        unit = Unit(file, {**identity, "view": str(i)}, Record, _REMEDY)
-        image, depth[i] = _view(unit, renderer, poses[i], drawn["spp"], view_seed)
+        unit = Unit(file, {**identity, "view": str(i)}, Record, remedy=_REMEDY)
+        image, depth[i] = _view(
+            unit, renderer, poses[i], spp=drawn["spp"], view_seed=view_seed
+        )
         files.write_image(root / names[i], image)
         progress(i + 1, n)
     files.write_safetensors(root / _DEPTH, {"depth": depth})

@@ -126,7 +126,7 @@ def _inside(
         pixels = max(camera.fx, camera.fy) / factor * radius / local[valid, 2]
         column, row = image[valid].T.astype(int) // factor
         outside = np.zeros(len(alive), bool)
-        outside[valid] = ~_touches(mask, row, column, pixels)
+        outside[valid] = ~_touches(mask, row, column, pixels=pixels)
         alive = alive[~outside]
     alive = alive[view_counts[alive] >= _SEEN_BY * len(chosen)]
     inside = np.zeros(len(points), bool)

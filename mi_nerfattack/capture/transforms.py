@@ -109,8 +109,8 @@ def read_transforms(
     used, paths = {i: frames[i] for i in image_paths}, list(image_paths.values())
     poses = read_frames(source, used)
     first = files.read_image(paths[0])
-    cameras = read_cameras(source, table, used, first.shape)
-    images, reduced = load_images(paths, cameras, source, long_edge_px)
+    cameras = read_cameras(source, table, used, image_shape=first.shape)
+    images, reduced = load_images(paths, cameras, source, long_edge_px=long_edge_px)
     masks = load_masks(
         [
             None
@@ -129,7 +129,7 @@ def read_transforms(
         names=names,
         missing=tuple(missing),
         cameras=differing(reduced),
-        points=_read_points(source, table, cameras, poses),
+        points=_read_points(source, table, cameras, poses=poses),
         unit=str(table.get("units", "unknown")),
         masks=masks,
     )
@@ -182,7 +182,9 @@ def _read_points(
     if key == "points_file":
         points = _own_points(source, where)
     else:
-        points = _turned_points(source, table, read_points(where), cameras, poses)
+        points = _turned_points(
+            source, table, read_points(where), cameras=cameras, poses=poses
+        )
     if not len(points):
         return None
     require_near(where, points)

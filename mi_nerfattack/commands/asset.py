@@ -84,8 +84,8 @@ class _Asset(ABC):
                 result,
                 views.images,
                 self.output,
-                provenance,
-                checkpoint,
+                provenance=provenance,
+                checkpoint=checkpoint,
             )
 
     def _options(self) -> FitOptions:
@@ -174,7 +174,9 @@ class AssetMesh(_Rendered):
     def _mesh(self) -> TexturedMesh:
         from mi_nerfattack.capture.object_views import Placement
 
-        placement = Placement(self.height_m, self.longest_m, self.up, self.turn_deg)
+        placement = Placement(
+            self.height_m, self.longest_m, self.up, turn_deg=self.turn_deg
+        )
         return placement.mesh(self.source)
 
 
@@ -231,9 +233,15 @@ class AssetFolder(_Asset):
     def _views(self, bars: StageBars) -> ObjectViews:
         from mi_nerfattack.capture.object_views import Placement, read_views
 
-        placement = Placement(self.height_m, self.longest_m, self.up, self.turn_deg)
+        placement = Placement(
+            self.height_m, self.longest_m, self.up, turn_deg=self.turn_deg
+        )
         return read_views(
-            self.source, placement, self.bounds, self.long_edge, self.skip_missing
+            self.source,
+            placement,
+            self.bounds,
+            long_edge_px=self.long_edge,
+            skip_missing=self.skip_missing,
         )
 
 

@@ -79,7 +79,7 @@ def _show(document: dict[str, Any], output: Path, frames: Frames | None) -> None
     for sentence in document["verdict"]:
         out.print(sentence, highlight=False)
     out.print(metrics_table(document))
-    _print_files(out, output, document, frames)
+    _print_files(out, output, document, frames=frames)
 
 
 def _print_files(

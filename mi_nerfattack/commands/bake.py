@@ -62,7 +62,7 @@ class Bake:
         from mi_nerfattack.scenario.world import load_posed
         from mi_nerfattack.vehicle.route.route import load_routes
 
-        options = BakeOptions(self.cone, self.passes, self.views, self.seed)
+        options = BakeOptions(self.cone, self.passes, self.views, seed=self.seed)
         scenario, _ = load_scenario(self.scenario, settings=self.settings)
         file, output = self._files(scenario)
         rig = scenario.rig()
@@ -101,7 +101,7 @@ class Bake:
             "bake_s": round(seconds, 1),
         }
         title = f"Bake of {file.name}"
-        page = write_bake_report(report_folder(output), views, facts, title)
+        page = write_bake_report(report_folder(output), views, facts, title=title)
         message = f"{bake_verdict(views)}\nWrote {output} and {page}."
         return Result(facts | bake_summary(views), lambda: print(message))
 

@@ -126,10 +126,14 @@ class Calibrate:
         from mi_nerfattack.car.vesc.guided import DRIVES, write_arcs
         from mi_nerfattack.car.vesc.motor import VescMotor
 
-        pad = JoystickEnable(self.enable, self.button, time.monotonic, self.silence_s)
+        pad = JoystickEnable(
+            self.enable, self.button, time.monotonic, silence_s=self.silence_s
+        )
         with (
             closing(pad),
-            closing(VescMotor(self.port, before, confirm, self.baudrate)) as motor,
+            closing(
+                VescMotor(self.port, before, confirm, baudrate=self.baudrate)
+            ) as motor,
         ):
             print(f"{self.port}: firmware {motor.firmware}")
             ask("Lift the wheels off the ground: they turn for a second. Enter")
@@ -142,7 +146,7 @@ class Calibrate:
             for name, sign in DRIVES.items():
                 if name not in arcs:
                     angle = sign * self.steering_rad
-                    arcs[name] = self._measure(motor, pad, name, angle)
+                    arcs[name] = self._measure(motor, pad, name, steering_rad=angle)
                     write_arcs(arcs_path, arcs)
 
     def _check(self, before: Calibration) -> None:
@@ -190,7 +194,7 @@ class Calibrate:
             wait_for_press(pad, time.sleep, say)
             try:
                 servo, steps = drive_arc(
-                    motor, command, self.distance_m, lambda: check_held(pad)
+                    motor, command, self.distance_m, check=lambda: check_held(pad)
                 )
             except ReleasedError as error:
                 print(f"Braked: {error}. Once more.")
@@ -206,7 +210,7 @@ def _ask_for_arc(servo: float, steps: int) -> Arc:
     while True:
         forward_m = _ask_number("How far along that line did the middle come, metres")
         left_m = _ask_number("How far to its left, metres (right: negative)")
-        arc = Arc(servo, steps, forward_m, left_m)
+        arc = Arc(servo, steps, forward_m, left_m=left_m)
         try:
             arc.check()
         except InputError as error:

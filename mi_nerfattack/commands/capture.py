@@ -126,7 +126,7 @@ class CaptureScene(_Capture):
         show(0, 1)
         picture = path.parent / "place.png"
         routes = load_routes(self.routes_file)
-        routes_picture(picture, self.source, routes, camera, mount)
+        routes_picture(picture, self.source, routes, camera=camera, mount=mount)
         show(1, 1)
         bars.say(f"{picture}: scene, routes and lanes from above; look at it first")
         message = f"Wrote {self.views} views to {path.parent}"
@@ -238,7 +238,7 @@ class CapturePhotographs(_Estimate):
         from mi_nerfattack.capture.photographs.estimate import estimate_poses
 
         options = self._tracked(options)
-        return estimate_poses(self.source, self.output, options, progress)
+        return estimate_poses(self.source, self.output, options, progress=progress)
 
 
 @dataclass(frozen=True)
@@ -273,9 +273,9 @@ class CaptureVideo(_Estimate):
         with tempfile.TemporaryDirectory() as folder:
             chosen = FrameOptions(self.most_frames, self.baseline)
             self._tracked(options, {})  # what is wrong with it, before a film is read
-            times = extract_frames(self.source, Path(folder), chosen, progress)
+            times = extract_frames(self.source, Path(folder), chosen, progress=progress)
             options = self._tracked(options, times)
-            return estimate_poses(folder, self.output, options, progress)
+            return estimate_poses(folder, self.output, options, progress=progress)
 
 
 def _tell(result: PoseEstimate, picture: Path) -> None:

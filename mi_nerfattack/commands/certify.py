@@ -91,10 +91,14 @@ class CertifyRobustness:
         workers = chosen_workers(self.workers, alone)
         with StageBars() as bars:
             document = certify_robustness(
-                scenario, self.output, settings, workers, partial(_show, bars)
+                scenario,
+                self.output,
+                settings,
+                workers=workers,
+                on_stage=partial(_show, bars),
             )
         lines = [f"flag: {line}" for line in document["flags"]]
-        return _result(document, robustness_table(document), lines, self.output)
+        return _result(document, robustness_table(document), lines, output=self.output)
 
 
 @dataclass(frozen=True)
@@ -148,7 +152,7 @@ class CertifyGradient:
                 on_stage=partial(_show, bars),
             )
         table = gradient_table(document)
-        return _result(document, table, sentences(document), self.output)
+        return _result(document, table, sentences(document), output=self.output)
 
 
 def _show(bars: StageBars, stage: str, done: int, total: int) -> None:

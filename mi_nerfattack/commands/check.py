@@ -78,7 +78,7 @@ class Check:
         show("drawing", 1, 1, "")
         check.price()
         document = {**check.document(), "picture": drawn and str(drawn)}
-        lines = checks.sentences(check, str(self.file), drawn, self.settings)
+        lines = checks.sentences(check, str(self.file), drawn, settings=self.settings)
         code = int(bool(check.refused))
         return Result(document, lambda: print(*lines, sep="\n"), code)
 

@@ -65,7 +65,9 @@ class CompareDrives:
         recordings = {case: getattr(self, case) for case in cases}
         drives = read_all(recordings, course, McapTopics.parse(self.topics))
         of_run = read_drives(attack.folder / DRIVES)
-        document = real_document(attack, course, of_run, drives, criteria)
+        document = real_document(
+            attack, course, of_run, drives=drives, criteria=criteria
+        )
         real = [item.drive for item in drives]
         files.make_folder(self.output)
         files.write_json(self.output / "metrics.json", document)
@@ -73,7 +75,9 @@ class CompareDrives:
         write_steps(self.output / "steps.csv", drawn, {course.route.name: lane})
         if real:
             path = self.output / "overhead.png"
-            overhead(path, drawn, course.route, [], lane.wheel_m)
+            overhead(
+                path, drawn, course.route, object_footprints=[], limit=lane.wheel_m
+            )
         lines = [] if criteria is None else [*sentences(criteria, document["test"])]
         lines.append(f"Written: {self.output.resolve()}")
 

@@ -60,8 +60,8 @@ class CompareField:
                 load_field(self.field),
                 self.scene,
                 self.routes_file,
-                options,
-                bars.counter("comparing with the scene"),
+                options=options,
+                progress=bars.counter("comparing with the scene"),
             )
         title = f"{self.field.name} against {self.scene.name}"
         compare.write_compare_report(output, comparison, title)
@@ -84,6 +84,6 @@ class CompareField:
             from_fov(*self.size, self.fov_deg),
             CameraMount(*self.mount),
             self.every_m,
-            self.lateral_m,
-            self.spp,
+            lateral_m=self.lateral_m,
+            spp=self.spp,
         )

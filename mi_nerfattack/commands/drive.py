@@ -145,8 +145,8 @@ def _open_rig(
     if config.simulated:
         from mi_nerfattack.props.rehearsal import open_rehearsal
 
-        return open_rehearsal(config, route, trained, overlaid)
-    return open_rig(config, route, trained, confirm, overlaid)
+        return open_rehearsal(config, route, trained, overlaid=overlaid)
+    return open_rig(config, route, trained, confirm=confirm, overlaid=overlaid)
 
 
 _UNBRAKED = (
@@ -221,7 +221,7 @@ def _drive(
     metadata["version"] = mi_nerfattack.__version__
     devices, clock = rig.devices, rig.clock
     camera = devices.camera.camera
-    log = DriveLog(path, camera, clock, time.time_ns(), metadata)
+    log = DriveLog(path, camera, clock, wall_ns=time.time_ns(), description=metadata)
     say(f"Log        {path}")
     loop = DriveLoop(
         devices,

@@ -114,7 +114,11 @@ class Evaluate:
             files.write_json(self.output, evaluation.card)
         if self.page is not None:
             self._write_page(
-                self.page, work, record, evaluation, time.monotonic() - start
+                self.page,
+                work,
+                record,
+                evaluation=evaluation,
+                wall_s=time.monotonic() - start,
             )
         return Result(
             evaluation.card, lambda: console().print(card_table(evaluation.card))
@@ -140,7 +144,7 @@ class Evaluate:
             },
         }
         path = write_policy_page(
-            folder, description, record, evaluation.card, evaluation.drives
+            folder, description, record, card=evaluation.card, drives=evaluation.drives
         )
         print(f"{path}: written", file=sys.stderr)
 
@@ -228,7 +232,7 @@ class Evaluate:
         api = load_client()
         session = CarlaSession(CarlaServer.parse(self.where.server), _PERIOD_S, api)
         try:
-            return tuple(town_routes(path, session.town_map, api, self.routes))
+            return tuple(town_routes(path, session.town_map, api, names=self.routes))
         finally:
             session.close()
 

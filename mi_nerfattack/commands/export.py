@@ -51,7 +51,9 @@ class ExportMesh:
         output = self.output
         check_suffix(output, ".glb")
         files.check_writable(output)
-        placement = Placement(self.height_m, self.longest_m, self.up, self.turn_deg)
+        placement = Placement(
+            self.height_m, self.longest_m, self.up, turn_deg=self.turn_deg
+        )
         if self.mesh is None and placement != Placement():
             raise InputError(
                 "--height-m, --longest-m, --up, --turn-deg: place a mesh; give --mesh"
@@ -182,7 +184,13 @@ class ExportScreen(ScreenOptions):
         edges = box.edges_mm(self.size_mm)
         spot = Net(edges, box.sheet).faces[face]
         size, longest = (spot.width, spot.height), float(edges.max())
-        image = screen_image(screen, box.images[face], size, self.background, longest)
+        image = screen_image(
+            screen,
+            box.images[face],
+            size,
+            background=self.background,
+            longest_mm=longest,
+        )
         if path.suffix.lower() == ".png":
             files.write_image(path, image)
         else:
@@ -237,7 +245,7 @@ class ExportRoutes:
         except RuntimeError as error:
             raise InputError(f"{self.map}: not an OpenDRIVE map ({error})") from error
         routes = town_routes(
-            self.routes_xml, town_map, api, self.routes, speed_ms=self.speed_ms
+            self.routes_xml, town_map, api, names=self.routes, speed_ms=self.speed_ms
         )
         files.write_json(
             self.output, {route.name: route.document() for route in routes}

@@ -153,8 +153,8 @@ class Fit:
             result,
             images,
             self.output,
-            provenance,
-            checkpoint,
+            provenance=provenance,
+            checkpoint=checkpoint,
         )
 
 
@@ -171,7 +171,7 @@ def _gap_warnings(images: PosedImages) -> Iterator[str]:
     fitted = np.ones(len(images), bool)
     fitted[skipped] = False
     cameras = [images.camera_of(i) for i in range(len(images))]
-    gaps = view_gaps(cameras, images.camera_to_world, images.points, fitted)
+    gaps = view_gaps(cameras, images.camera_to_world, images.points, others=fitted)
     gap = float(np.median(gaps[skipped]))
     if gap > FAR_DEG:
         yield (

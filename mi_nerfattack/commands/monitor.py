@@ -44,7 +44,9 @@ class ScreenOptions:
         across, down = _pair("--aspect", self.aspect, ":")
         width, height = map(round, _pair("--pixels", self.pixels, "x"))
         check_levels(self.background)
-        return Screen(width, height, self.diagonal_in, across / down, self.gamma)
+        return Screen(
+            width, height, self.diagonal_in, aspect=across / down, gamma=self.gamma
+        )
 
 
 def _pair(name: str, text: str, mark: str) -> tuple[float, float]:
@@ -100,7 +102,7 @@ class Monitor(ScreenOptions):
         page = follow_page(standing, box, self.background)
         camera = camera_to_body(views.mount)[:3, 3]
         tracker = open_tracker(
-            self.tracker, views.mount, self.rotation, self.tracker_sender
+            self.tracker, views.mount, self.rotation, sender=self.tracker_sender
         )
 
         with closing(tracker):

@@ -63,7 +63,11 @@ class OverlayCommand:
         box, views = read_box(self.run_folder, self.box)
         topics = McapTopics.parse(self.topics)
         recording = open_recording(
-            self.recording, views.camera, views.mount, views.period, topics
+            self.recording,
+            views.camera,
+            views.mount,
+            period=views.period,
+            topics=topics,
         )
         alone = (
             nullcontext() if is_video else locks.claimed(self.output, "choose another")

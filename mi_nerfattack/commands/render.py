@@ -47,7 +47,11 @@ class _Render:
         from mi_nerfattack.scenes import resolve
 
         return FrameRenderer(
-            resolve(self.scene), self.sensor, self.spp, self._parameters(), self.size
+            resolve(self.scene),
+            self.sensor,
+            self.spp,
+            parameters=self._parameters(),
+            size_px=self.size,
         )
 
     def _parameters(self) -> dict[str, str]:
@@ -142,7 +146,9 @@ class RenderPath(_Render):
         variant.ensure()
         poses = self._poses()
         renderer = self._renderer()
-        shot = Shot(renderer, poses, self.seed, self.precision, self.force)
+        shot = Shot(
+            renderer, poses, self.seed, precision=self.precision, anew=self.force
+        )
         return self._write(shot)
 
     def _check(self) -> None:
@@ -202,7 +208,7 @@ class RenderPath(_Render):
 
             try:
                 if is_video:
-                    size = render_video(shot, self.output, self.fps, show)
+                    size = render_video(shot, self.output, self.fps, progress=show)
                 else:
                     size = shot.renderer.size_px
                     render_folder(shot, folder, show)

@@ -66,7 +66,7 @@ class Report:
                 bars.say(f"reading {label}")
 
             contents = read_folders(self.folders, Path(scratch), say)
-            write_page(self.output, contents, Path(scratch), self.title)
+            write_page(self.output, contents, Path(scratch), title=self.title)
         return self._written()
 
     def _written(self) -> Result:

@@ -78,15 +78,15 @@ class Reproduce:
             files.check_folder(self.output)
         workers = Processes(cells_at_a_time(self.workers, self.cores), pieces_each=1)
         variant.ensure()
-        replay = read_replay(self.folder, self.row, self.rows, self.seed)
+        replay = read_replay(self.folder, self.row, self.rows, seed=self.seed)
         with self._place({cell.id for cell in replay.cells}) as place:
             output = Path(place)
             if self.drives_only:
                 take_checkpoints(replay, self.folder, output)
-            sweep = do_cells(replay.cells, output, self.cores, workers)
+            sweep = do_cells(replay.cells, output, self.cores, workers=workers)
             errors = {replay.cells[i].id: error for i, error in sweep.errors.items()}
             again, made = read_table(sweep.table), read_made(output)
-            comparison = compare_rows(replay, again, made, errors)
+            comparison = compare_rows(replay, again, made, errors=errors)
         code = int(bool(errors) or self._is_exceeded(comparison))
         return Result(comparison, lambda: print(*sentences(comparison), sep="\n"), code)
 

@@ -131,23 +131,31 @@ class Retrain:
 
         alone = isinstance(policy.attacked, HttpSection)
         workers = chosen_workers(self.workers, alone)
-        frames = FramesAmong(sites, groups[OLD], settings, self.data, workers)
+        frames = FramesAmong(
+            sites, groups[OLD], settings, folder=self.data, workers=workers
+        )
         names = self.environments
         drives = Comparison(groups, names, self.runs, self.spp, self.data)
         with StageBars() as bars:
             before = drives.drive(BEFORE, workers, bars.counter)
             shards = frames.collect(bars.show) if training else []
-            card = {} if training else self._fine_tune(frames, policy, old_shards, bars)
+            card = (
+                {}
+                if training
+                else self._fine_tune(frames, policy, old_shards, bars=bars)
+            )
         trained: dict[str, Any] = {}
         if training:  # without bars, which the output of a command would break
-            trained = self._train(training, order, policy, shards, groups[OLD][0])
+            trained = self._train(
+                training, order, policy, shards=shards, attack=groups[OLD][0]
+            )
         with StageBars() as bars:
             setting = policy.setting(self.output)
             after = drives.drive(AFTER, workers, bars.counter, setting)
             anew = self._adapt(
                 drives, before, after, policy=setting, workers=workers, bars=bars
             )
-        document = _describe(policy.content, groups, anew, others) | trained
+        document = _describe(policy.content, groups, anew, others=others) | trained
         document["table"] = table_rows(before, after)
         files.write_json(comparison_path, document)
 
@@ -243,7 +251,7 @@ class Retrain:
         result = frames.imitate(PilotNet.load(policy.file), old_shards, bars.show)
         command = command_line("retrain", self)
         record = training_record(
-            frames.settings, frames.sites, self.data, result, command
+            frames.settings, frames.sites, self.data, result=result, command=command
         )
         write_trained(self.output, result.module, record)
         return result.card
@@ -265,7 +273,7 @@ class Retrain:
             training,
             order,
             shards,
-            lambda: try_policy(attack, policy.setting(order.out), self.adaptive),
+            check=lambda: try_policy(attack, policy.setting(order.out), self.adaptive),
         )
         install(order.out, self.output)
         return {"training": {**record, "frames": count_frames(self.data, shards)}}
@@ -289,7 +297,9 @@ class Retrain:
             return []
         show = bars.counter("attacking anew", "attack ")
         folder = self.data / ADAPTIVE
-        anew = attack_anew(drives.groups[OLD], policy, folder, workers, show)
+        anew = attack_anew(
+            drives.groups[OLD], policy, folder, workers=workers, progress=show
+        )
         again = replace(drives, groups={ADAPTIVE: anew})
         after.update(again.drive(AFTER, workers, bars.counter))
         before[ADAPTIVE] = before[OLD]  # past the attacks on the policy before

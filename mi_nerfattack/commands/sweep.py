@@ -99,7 +99,7 @@ class Sweep:
         from mi_nerfattack.experiment.sweep.summary import write_summary
         from mi_nerfattack.report.table import sweep_table
 
-        sweep = do_cells(cells, self.output, self.cores, workers, taken)
+        sweep = do_cells(cells, self.output, self.cores, workers=workers, taken=taken)
         document = write_summary(sweep.work.folder, taken.attacks)
         failed = {cells[i].id: error for i, error in sorted(sweep.errors.items())}
         summary = {

@@ -159,7 +159,9 @@ class Train:
                 earlier_shards=earlier_shards,
             )
         command = command_line("train", self)
-        record = training_record(settings, sites, self.data, result, command)
+        record = training_record(
+            settings, sites, self.data, result=result, command=command
+        )
         document = write_trained(output, result.module, record)
         picture = output.with_name(f"{output.stem}-place.png")
         self._draw(picture, f"{output.name}: where it was trained", place, routes)

@@ -106,7 +106,7 @@ class Transfer:
                 f"{len(work.rows)} rows, {count} drives, kept in {work.store.folder}"
             )
             progress = bars.counter("driving", "step ")
-            document = run_transfer(work, self.output, workers, progress)
+            document = run_transfer(work, self.output, workers, progress=progress)
 
         def show() -> None:
             out = console()

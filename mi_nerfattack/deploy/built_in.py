@@ -135,8 +135,8 @@ def make_built_in(
         raise InputError(
             f"captured_irradiance: {captured_irradiance}; must be positive and finite"
         )
-    shell = shell_of(field, mesh, placement, texel_m)
-    return paint(shell, field, pose, captured_irradiance)
+    shell = shell_of(field, mesh, placement, texel_m=texel_m)
+    return paint(shell, field, pose, captured_irradiance=captured_irradiance)
 
 
 def shell_of(
@@ -160,7 +160,7 @@ def shell_of(
         check_same_box(field, solid)
         corners = _outward(field, _solid_corners(solid))
         normals = _flat_normals(corners)
-    return Shell(corners, normals, lay_out(corners, texel), solid is None)
+    return Shell(corners, normals, lay_out(corners, texel), is_smooth=solid is None)
 
 
 def paint(
@@ -171,7 +171,7 @@ def paint(
     See :func:`make_built_in`.
     """
     corners, normals, atlas = shell.corners, shell.normals, shell.atlas
-    radiance = _texel_colours(field, atlas, corners, normals)
+    radiance = _texel_colours(field, atlas, corners, normals=normals)
     albedo = linear_to_uint8(np.pi / captured_irradiance * radiance)
     return BuiltInObject(
         vertices=corners.reshape(-1, 3),

@@ -95,8 +95,8 @@ def join_frames(frames: Sequence[CameraFrame], layout: Layout) -> CameraFrame:
         layout.join([frame.image for frame in frames]),
         _join_depths([frame.depth for frame in frames], layout),
         frames[0].camera_to_world,
-        light,
-        partial(_join_layers, frames, layout),
+        linear=light,
+        split=partial(_join_layers, frames, layout),
     )
 
 
@@ -114,7 +114,7 @@ def first_frame(frame: CameraFrame, layout: Layout) -> CameraFrame:
         layout.split(frame.image)[0],
         layout.split(frame.depth[..., None])[0][..., 0],
         frame.camera_to_world,
-        linear,
+        linear=linear,
     )
 
 
@@ -310,7 +310,7 @@ def drive(
     states, controls = [environment.state], []
     for index in range(steps):
         image = policy_image(frame.image)
-        numbers = policy_numbers(policy, environment, route, index)
+        numbers = policy_numbers(policy, environment, route, step=index)
         row, memory = policy.step(image, route.goal, memory, numbers)
         controls.append(single_control(row, environment.control_names))
         frame = environment.step(controls[-1])
@@ -367,7 +367,7 @@ def policy_numbers(
     if policy.numbers.speed:
         row = to_state(np.full((1, 3), environment.speed))[0]  # opaque
     time = step * environment.period
-    return stacked(numbers_of(policy.numbers, state, row, time, route))
+    return stacked(numbers_of(policy.numbers, state, row, time=time, route=route))
 
 
 def trial_numbers(policy: AbstractPolicy) -> Any:

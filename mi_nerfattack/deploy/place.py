@@ -43,8 +43,8 @@ class Scatter:
         """Draw states (n, 3) at arc lengths (n,), metres."""
         count = len(arc)
         factor = np.where(rng.uniform(size=count) < self.close_share, 0.2, 1.0)
-        lateral = cut_normal(self.lateral_sd_m, self.lateral_max_m, count, rng)
-        heading = cut_normal(self.heading_sd, self.heading_max, count, rng)
+        lateral = cut_normal(self.lateral_sd_m, self.lateral_max_m, count, rng=rng)
+        heading = cut_normal(self.heading_sd, self.heading_max, count, rng=rng)
         states = route.pose_at(arc, factor * lateral)
         # the route's own heading jumps at the vertices of the polyline
         states[:, 2] = route.heading_at(arc) + factor * heading

@@ -34,7 +34,11 @@ def kinematic_vehicle(place: Place) -> KinematicVehicle:
         turned = Dubins(max_heading_rate=car.max_control)
         motion = Motion(steered if car.control_unit == "rad" else turned)
     return KinematicVehicle(
-        motion, place.period, car.max_control, car.control_unit, car.more_controls
+        motion,
+        place.period,
+        car.max_control,
+        control_unit=car.control_unit,
+        more_controls=car.more_controls,
     )
 
 
@@ -43,7 +47,7 @@ def mitsuba_views(place: Place, conditions: Conditions) -> list[MitsubaView]:
     scene = load_scene(place.scene, shapes=built_in_shapes(conditions.built_in))
     set_daylight(scene, conditions.sky)
     return [
-        MitsubaView(scene, camera, conditions.spp, conditions.exposure_ev)
+        MitsubaView(scene, camera, conditions.spp, exposure_ev=conditions.exposure_ev)
         for camera in place.rig.cameras
     ]
 
@@ -56,20 +60,22 @@ def _surrogate(place: Place, conditions: Conditions) -> AbstractEnvironment:
         )
     _refuse_built_in("surrogate", conditions)
     scene = PosedField(load_field(place.field), place.field_pose)
-    sensor = field_sensor(scene, [], place.camera, place.mount).with_rig(place.rig)
+    sensor = field_sensor(scene, [], place.camera, mount=place.mount).with_rig(
+        place.rig
+    )
     return SurrogateEnvironment(sensor, kinematic_vehicle(place))
 
 
 def _mitsuba(place: Place, conditions: Conditions) -> AbstractEnvironment:
     vehicle = kinematic_vehicle(place)
-    return _pair("mitsuba", vehicle, mitsuba_views(place, conditions), place)
+    return _pair("mitsuba", vehicle, mitsuba_views(place, conditions), place=place)
 
 
 def _mujoco(place: Place, conditions: Conditions) -> AbstractEnvironment:
     from mi_nerfattack.deploy.mujoco.vehicle import MujocoVehicle
 
     vehicle = MujocoVehicle(place.car, period=place.period)
-    return _pair("mujoco", vehicle, mitsuba_views(place, conditions), place)
+    return _pair("mujoco", vehicle, mitsuba_views(place, conditions), place=place)
 
 
 def _mujoco_gl(place: Place, conditions: Conditions) -> AbstractEnvironment:
@@ -79,11 +85,13 @@ def _mujoco_gl(place: Place, conditions: Conditions) -> AbstractEnvironment:
     scene = load_scene(place.scene)
     set_daylight(scene, conditions.sky)
     views = [
-        MujocoView(scene, camera, conditions.built_in, conditions.exposure_ev)
+        MujocoView(
+            scene, camera, conditions.built_in, exposure_ev=conditions.exposure_ev
+        )
         for camera in place.rig.cameras
     ]
     vehicle = MujocoVehicle(place.car, period=place.period)
-    return _pair("mujoco_gl", vehicle, views, place)
+    return _pair("mujoco_gl", vehicle, views, place=place)
 
 
 def _carla(place: Place, conditions: Conditions) -> AbstractEnvironment:
@@ -101,8 +109,8 @@ def _carla(place: Place, conditions: Conditions) -> AbstractEnvironment:
         server,
         place.camera,
         place.mount,
-        driver,
-        place.period,
+        driver=driver,
+        period=place.period,
         attributes=exposure if conditions.exposure_ev else None,
     )
 
@@ -126,8 +134,8 @@ def _replay(place: Place, conditions: Conditions) -> AbstractEnvironment:
         place.recording,
         place.camera,
         place.mount,
-        place.period,
-        McapTopics.parse(place.topics),
+        period=place.period,
+        topics=McapTopics.parse(place.topics),
     )
     car = place.car
     return ReplayEnvironment(
@@ -159,7 +167,9 @@ def _refuse_disturbed(name: str, conditions: Conditions) -> None:
 def _pair(
     name: str, vehicle: AbstractVehicle, views: Sequence[AbstractView], place: Place
 ) -> SimulatedEnvironment:
-    return SimulatedEnvironment(name, vehicle, views, place.rig, place.period)
+    return SimulatedEnvironment(
+        name, vehicle, views, rig=place.rig, period=place.period
+    )
 
 
 #: What takes several cameras.
@@ -202,7 +212,7 @@ def offered_environment(
     from mi_nerfattack.system import entry_points
 
     group, known = entry_points.ENVIRONMENTS, known or ENVIRONMENTS
-    offer = entry_points.find(group, name, known, where)
+    offer = entry_points.find(group, name, known, where=where)
     if not callable(offer.value):
         raise offer.refuse(f"is {offer.value!r}, no function")
     return offer

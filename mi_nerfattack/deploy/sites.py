@@ -198,8 +198,8 @@ class PlaceSite(AbstractSite):
             load_scene(place.scene),
             load_routes(place.routes),
             place.camera,
-            place.mount,
-            place.period,
+            mount=place.mount,
+            period=place.period,
         )
 
     def describe(self) -> dict[str, Any]:
@@ -237,8 +237,8 @@ def expert_of(site: AbstractSite, route: Route) -> AbstractExpert:
         car.control_unit,
         route,
         site.period,
-        car.max_control,
-        car.wheelbase,
+        max_control=car.max_control,
+        wheelbase=car.wheelbase,
         acceleration=acceleration_of(car.more_controls),
     )
 

@@ -175,8 +175,8 @@ class KinematicVehicle(AbstractVehicle):
                 replace(motion.dynamics, **changed),
                 motion.integrator,
                 self.period,
-                motion.substeps,
-                motion.delay,
+                substeps=motion.substeps,
+                delay=motion.delay,
             )
         self._transition = self._transitions[key]
         extended = self._transition.dynamics.extend(np.asarray(pose, np.float64))

@@ -132,7 +132,7 @@ class Store:
         return self.shared is not None and (self.shared / _name(spec)).exists()
 
     def _unit(self, path: Path, spec: DriveSpec) -> Unit[DriveRecord]:
-        return Unit(path, spec.identity, DriveRecord, _REMEDY)
+        return Unit(path, spec.identity, DriveRecord, remedy=_REMEDY)
 
 
 def _name(spec: DriveSpec) -> str:
@@ -151,7 +151,9 @@ def read_drive(path: Path) -> Drive:
     Raises:
         InputError: the file is missing, damaged, or of another format.
     """
-    stored = Unit(path, {"format": FORMAT}, DriveRecord, _REMEDY).read(force=True)
+    stored = Unit(path, {"format": FORMAT}, DriveRecord, remedy=_REMEDY).read(
+        force=True
+    )
     if stored is None:
         raise InputError(f"{path}: missing; it was removed")
     with misfits_reported(path):

@@ -108,4 +108,4 @@ def agreement(predicted: np.ndarray, real: np.ndarray) -> Agreement | None:
     at = np.arctanh(np.clip(cosine, -1 + 1e-12, 1 - 1e-12))
     width = float(scipy.stats.norm.ppf(0.975)) / np.sqrt(n - 2)
     ends = float(np.tanh(at - width)), float(np.tanh(at + width))
-    return Agreement(slope, (slope - reach, slope + reach), cosine, ends)
+    return Agreement(slope, (slope - reach, slope + reach), cosine, cosine_ci95=ends)

@@ -228,7 +228,9 @@ def evaluate(
     if objects:
         for environment in environments:
             period = environment.period
-            check_places(period, routes, objects, surroundings, settings)
+            check_places(
+                period, routes, objects, surroundings=surroundings, settings=settings
+            )
     jobs = [
         (environment, route, case, run)
         for environment in environments
@@ -361,7 +363,7 @@ def place_objects(
             f"EvaluateSettings.objects: {count}, and {len(objects)} fields are there; "
             "each object needs a field of its own and a scene to stand in; or 0"
         )
-    rng = _generator(settings, route, run, count)
+    rng = _generator(settings, route, run, objects=count)
     kinds = sorted((run + index) % len(objects) for index in range(count))
     fields = [objects[kind] for kind in kinds]
     for item in fields:

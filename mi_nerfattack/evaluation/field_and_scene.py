@@ -158,7 +158,7 @@ def compare_with_scene(
             errors.append(error)
             done += 1
             progress(done, total)
-        result.append(_along(route, stations, np.hstack(errors), options.camera))
+        result.append(_along(route, stations, np.hstack(errors), camera=options.camera))
     return Comparison(tuple(result), options, time.perf_counter() - started)
 
 
@@ -189,7 +189,9 @@ class _Eyes:
         halves = [linear_to_srgb_numpy(view.rgb).astype(np.float64) for view in views]
         noise = float(np.mean((halves[0] - halves[1]) ** 2)) / 4  # of their mean
         name, depth = f"at {arc:.1f} m", views[0].depth
-        score = self.field.score(name, options.camera, pose, image, depth=depth)
+        score = self.field.score(
+            name, options.camera, pose, expected=image, depth=depth
+        )
         assert score.pictures is not None
         shown = score.pictures.shown
         errors = depth_errors(shown.depth, depth, options.near_m)

@@ -133,7 +133,9 @@ def noise_larger(effect: Effect, figure: str) -> Iterator[str]:
         figure: name of the compared figure, in words.
     """
     if effect.spread is not None and abs(effect.difference) < effect.spread:
-        yield _noise_told(figure, effect.difference, effect.spread, "seed to seed")
+        yield _noise_told(
+            figure, effect.difference, effect.spread, between="seed to seed"
+        )
 
 
 def _random_enough(name: str, cases: Figures) -> Iterator[str]:
@@ -170,7 +172,9 @@ def _noise(name: str, cases: Figures, has_objective: bool) -> Iterator[str]:
     if effect < noise:
         what = "objective" if has_objective else "mean error"
         unit = "" if has_objective else " (m)"
-        yield _noise_told(f"{what} in {name}{unit}", effect, noise, "drive to drive")
+        yield _noise_told(
+            f"{what} in {name}{unit}", effect, noise, between="drive to drive"
+        )
 
 
 def _noise_told(what: str, effect: float, noise: float, between: str) -> str:

@@ -74,7 +74,9 @@ def summarise(
     cost = () if costs is None else ("objective",)
     table["texture"] = table["run"].where(table["case"] == RANDOM, 0)
     result: dict[str, dict[str, dict[str, dict[str, Any]]]] = {}
-    for row in sorted(records(summary(table, _GROUP, ["texture"], seed)), key=_order):
+    for row in sorted(
+        records(summary(table, _GROUP, ["texture"], seed=seed)), key=_order
+    ):
         route, environment, case = (row[name] for name in _GROUP)
         own = table[(table[_GROUP] == [route, environment, case]).all(axis=1)]
         result.setdefault(route, {}).setdefault(environment, {})[case] = {
@@ -100,7 +102,7 @@ def card_figures(
     """
     lanes = {drives[0].route: Lane(limit, limit)}
     table = drives_table(drives, lanes).sort_values("run", kind="stable")
-    [figures] = records(summary(table, _GROUP, ["run"], seed))
+    [figures] = records(summary(table, _GROUP, ["run"], seed=seed))
     return {
         "n": figures["drives"],
         **{name: figures[name] for name in _OF_CARD},
@@ -175,7 +177,7 @@ def metrics_document(
     Returns:
         A document for `files.write_json`.
     """
-    routes = summarise(drives, lanes, seed, costs)
+    routes = summarise(drives, lanes, seed, costs=costs)
     document = {
         "schema": SCHEMA,
         "scenario": dict(scenario),

@@ -46,7 +46,9 @@ def verdict(document: Figures, surrogate: str) -> list[str]:
         sentences += _lane({name: environments[name] for name in names}, limit)
         sentences.append(_policy(environments, limit))
         for name in names:
-            sentences += _attack(document, name, environments[name], name == surrogate)
+            sentences += _attack(
+                document, name, environments[name], is_surrogate=name == surrogate
+            )
     for name, replayed in document.get("replay", {}).items():
         sentences += _replayed(name, replayed)
     sentences += _search(document)
@@ -106,7 +108,7 @@ def _by_starts(
     drives = drives[drives["environment"] == environment]
     drives = drives.assign(scenario=drives["start"].astype(str))
     one, other = (drives[drives["case"] == case] for case in cases)
-    return compare(one, other, figure, document["seed"])
+    return compare(one, other, figure, seed=document["seed"])
 
 
 def _interval(ends: Sequence[float] | None, starts: int, digits: str) -> str:
@@ -130,7 +132,7 @@ def _attack(
         drawn = f"{count} of the {equal} {random} that its cost pays for"
     objective = document.get("objective")
     if objective is None:
-        beats, text = _by_error(document, name, cases, drawn)
+        beats, text = _by_error(document, name, cases, drawn=drawn)
     elif any(cases[case].get(OBJECTIVE) is None for case in cases):
         why = objective["missing"].get(name, "a drive ended before the others")
         yield f"The objective has no value in {name}, which is not judged: {why}."
@@ -138,7 +140,7 @@ def _attack(
     elif OWN not in cases:
         return
     else:
-        beats, text = _by_objective(document, name, cases, drawn)
+        beats, text = _by_objective(document, name, cases, drawn=drawn)
     if is_surrogate:
         lead = "beats" if beats else "does not beat"
         yield f"The attack {lead} {random} in the surrogate: {text}."
@@ -155,7 +157,7 @@ def _by_error(
     """Judge an attack by the mean distance from the lane centre."""
     mean = cases[ATTACK][ERROR]
     ratio = _ratio(mean, cases[RANDOM][ERROR])
-    effect = _by_starts(document, name, (ATTACK, RANDOM), ERROR)
+    effect = _by_starts(document, name, (ATTACK, RANDOM), figure=ERROR)
     text = f"a mean error of {mean:.3f} m, {ratio:.1f} times that of {drawn}"
     text += _interval(effect.ratio_ci95, effect.attacks, ".1f")
     if BEST_RANDOM in cases:
@@ -169,7 +171,7 @@ def _by_objective(
 ) -> tuple[bool, str]:
     """Judge an attack by its own objective, see :func:`verdict`."""
     gains = {
-        case: _by_starts(document, name, (OWN, case), OBJECTIVE)
+        case: _by_starts(document, name, (OWN, case), figure=OBJECTIVE)
         for case in (ATTACK, RANDOM, BEST_RANDOM)
         if case in cases
     }

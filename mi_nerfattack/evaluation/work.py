@@ -152,7 +152,13 @@ class EvaluateDrives(AbstractDrives):
             for count in self.settings.objects:
                 some = self.first(objects, count)
                 only = replace(self.settings, objects=(count,))
-                check_places(self.place.period, self.routes, some, around, only)
+                check_places(
+                    self.place.period,
+                    self.routes,
+                    some,
+                    surroundings=around,
+                    settings=only,
+                )
         for under in dict.fromkeys(spec.context.under for spec in missing):
             make_environment(under.name, self.build_place(), under.conditions).close()
 
@@ -230,8 +236,8 @@ class EvaluateDriver(AbstractDriver):
             environment.control_unit,
             route,
             environment.period,
-            environment.max_control,
-            self._work.place.car.wheelbase,
+            max_control=environment.max_control,
+            wheelbase=self._work.place.car.wheelbase,
             acceleration=acceleration_of(environment.more_controls),
         )
         return ExpertPolicy(environment, expert)

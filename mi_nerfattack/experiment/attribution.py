@@ -95,7 +95,7 @@ def plot_control_changes(output: Path, drives: Sequence[Drive], unit: str) -> No
     """
     for environment, group in _environments(drives).items():
         path = output / f"controls_{environment}.png"
-        control_change(path, group, _own(group), unit)
+        control_change(path, group, _own(group), unit=unit)
 
 
 def _environments(drives: Sequence[Drive]) -> dict[str, list[Drive]]:
@@ -168,7 +168,9 @@ def attribute(
         objects=list(objects),
     )
     subject = "gradient" if attack.freedom.texture_rate is not None else UNCHANGED
-    return FailureAttribution(times, by_period.attribution.norms, textures, subject)
+    return FailureAttribution(
+        times, by_period.attribution.norms, textures, subject=subject
+    )
 
 
 def write_attribution(

@@ -55,7 +55,7 @@ class RandomAppearances:
         """Make the random appearances of a scenario."""
         scenario = world.scenario
         freedom, kind = scenario.attack.freedom.build(), scenario.baseline.kind
-        return cls(RandomLooks(world.fields, freedom, kind, scenario.seed), own)
+        return cls(RandomLooks(world.fields, freedom, kind, seed=scenario.seed), own)
 
     def __call__(self, number: int) -> Appearance:
         """Return an appearance by its number."""
@@ -147,7 +147,7 @@ class Judgements(AbstractWork):
     def _unit(self, number: int) -> Unit[Judged]:
         identity = {"format": FORMAT, **self.identity, "look": f"{number}"}
         name = f"look_{number:04d}-{short_digest(identity)}.safetensors"
-        return Unit(self.folder / name, identity, Judged, "remove the file")
+        return Unit(self.folder / name, identity, Judged, remedy="remove the file")
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the judge behind, whose world no process can send."""

@@ -250,7 +250,9 @@ class Cases:
         def progress(done: int, total: int) -> None:
             self.on_progress("drives", done, total, "")
 
-        finished_groups = run_drives(self._work(specs), workers, progress, on_groups)
+        finished_groups = run_drives(
+            self._work(specs), workers, progress, on_groups=on_groups
+        )
         return [item.drive for [item] in finished_groups]
 
     def counter(self) -> Callable[[int], None]:

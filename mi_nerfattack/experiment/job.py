@@ -117,7 +117,7 @@ class Job:
         identity = {**versions(), **described}
         text = portable_text(self.scenario, self.text)
         strict = self.scenario.attack.deterministic
-        folder = RunFolder(self.output, text, identity, self.shared)
+        folder = RunFolder(self.output, text, identity, shared=self.shared)
         with deterministic(strict):
             folder.read(force, self.on_notice)
             world = build_world(self.scenario, self.policy)
@@ -155,7 +155,7 @@ class Job:
             flags = self._check(world, folder, cases, anyway)
             attack = self._attack(world, folder, account, save)
             cases.looks[ATTACK] = world.appearance()
-            baseline = Baseline.of(world, cases.own, attack, effort())
+            baseline = Baseline.of(world, cases.own, attack, effort=effort())
             self._judge(baseline, folder, cases)
             specs = list(self._specs(cases, baseline))
             drives = cases.drive(specs, self.workers)

@@ -167,7 +167,7 @@ def read_all(
     drives: list[RealDrive] = []
     for case, paths in recordings.items():
         for run, path in enumerate(paths):
-            drive = read_real(path, case, run, course, topics)
+            drive = read_real(path, case, run, course=course, topics=topics)
             for other in drives:
                 is_same = other.began_s == drive.began_s
                 if is_same and np.array_equal(other.drive.states, drive.drive.states):
@@ -200,12 +200,14 @@ def read_real(
         InputError: it cannot be read, is in another frame of the world, is nowhere on
             the stretch, or has too few poses.
     """
-    recording = open_recording(path, course.camera, course.mount, course.period, topics)
+    recording = open_recording(
+        path, course.camera, course.mount, period=course.period, topics=topics
+    )
     with closing(recording):
         track, remarks = recording.track, recording.remarks
     states = vehicle_states(track, course.mount)
     arcs = course.arcs(states)
-    first, last = _cut(states, track.times, arcs, course)
+    first, last = _cut(states, track.times, arcs, course=course)
     _check_frame(path, states[first], course)
     if last - first < 2:
         raise InputError(
@@ -218,7 +220,7 @@ def read_real(
     begin = course.start_m if had_run_up else arcs[first]
     cut = slice(first, last + 1)
     states, times = states[cut], track.times[cut]
-    _check_gaps(path, states, first, course)
+    _check_gaps(path, states, first, course=course)
     covered = min(arcs[cut].max(), course.end_m) - begin
     way = float(np.hypot(*np.diff(states[:, :2], axis=0).T).sum())
     errors = course.route.cross_track_numpy(states)
@@ -235,7 +237,15 @@ def read_real(
     )
     is_out = bool(abs(errors[-1]) > course.lane.centre_m)
     covered, driven = covered / course.length_m, way / course.length_m
-    return RealDrive(path, drive, float(times[0]), covered, driven, is_out, remarks)
+    return RealDrive(
+        path,
+        drive,
+        float(times[0]),
+        coverage=covered,
+        driven=driven,
+        is_out=is_out,
+        remarks=remarks,
+    )
 
 
 def _check_frame(path: Path, state: np.ndarray, course: Course) -> None:
@@ -311,7 +321,7 @@ def real_document(
     everything = [*of_run, *(item.drive for item in drives)]
     lanes = {course.route.name: course.lane}
     document = metrics_document(
-        run["scenario"], run["seed"], everything, lanes, run["cost"]
+        run["scenario"], run["seed"], everything, lanes=lanes, cost=run["cost"]
     )
     cases = document["routes"][course.route.name].get(REAL, {})
     rows, outcomes = [], []

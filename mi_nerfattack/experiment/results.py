@@ -103,7 +103,7 @@ def write_results(
     if frames is None:
         return document
     try:
-        write_images(output, done, history, frames, on_progress)
+        write_images(output, done, history, frames=frames, on_progress=on_progress)
         document["cost"] = effort().model_dump()
         files.write_json(path, document)
         contents = PageContents(runs=[read_run(output, output.name)])
@@ -159,7 +159,9 @@ def _describe(done: Finished, effort: Callable[[], Effort]) -> dict[str, Any]:
         means = _optimised_and_exact(done)
         sections |= {"bricks": {"file": str(bricks), **means}} if bricks else {}
         sections |= {"one_level": means} if one_level else {}
-    sections |= texture_figures(world, done.drives, done.look(OWN), done.look(ATTACK))
+    sections |= texture_figures(
+        world, done.drives, done.look(OWN), attacked=done.look(ATTACK)
+    )
     values, cost = scenario.model_dump(mode="json"), effort().model_dump()
     document = metrics_document(
         values, scenario.seed, done.driven, lanes=lanes, cost=cost, costs=done.costs

@@ -65,7 +65,7 @@ class CheckpointFile:
     def __init__(self, path: Path, identity: Mapping[str, str]) -> None:
         self.path = path
         identity = {"format": CHECKPOINT_FORMAT, **identity}
-        self._unit = Unit(path, identity, CheckpointRecord, REMEDY)
+        self._unit = Unit(path, identity, CheckpointRecord, remedy=REMEDY)
         self.iteration = 0
         self.seconds = 0.0
         self.failed = False
@@ -288,7 +288,7 @@ class RunFolder:
         self.drives = Store(path / DRIVES, shared)
         self.effort = Effort()
         own = {"format": FORMAT, **identity}
-        self._effort = Unit(path / EFFORT, own, Effort, REMEDY)
+        self._effort = Unit(path / EFFORT, own, Effort, remedy=REMEDY)
 
     def read(self, force: bool, on_notice: Callable[[str], None]) -> None:
         """Take up what a run left; nothing is written.

@@ -151,7 +151,7 @@ class BrickField(AbstractField):
         check_positive("step_m", self.step_m)
         if not 0 <= self.cone <= 1:
             raise InputError(f"cone: {self.cone}; allowed is 0 to 1")
-        check_bricks(int(occupancy.cells.sum()), subdivisions, vertices, sky)
+        check_bricks(int(occupancy.cells.sum()), subdivisions, vertices, sky=sky)
         self.codes = codes
         self.info: dict[str, str] = dict(info or {})
         self.occupy(occupancy)

@@ -119,8 +119,8 @@ def _rows(path: str | Path, check: Callable[[str | Path, list[str]], None]) -> A
     encoding, count, dtype, start = _header(path, raw)
     check(path, list(dtype.names or ()))
     if encoding == "ascii":
-        return _ascii_rows(path, raw[start:], count, dtype)
-    return _binary_rows(path, raw, count, dtype, start)
+        return _ascii_rows(path, raw[start:], count, dtype=dtype)
+    return _binary_rows(path, raw, count, dtype=dtype, start=start)
 
 
 def _header(path: str | Path, raw: bytes) -> tuple[str, int, np.dtype, int]:

@@ -45,8 +45,8 @@ class Score:
             self.loss + other.loss,
             self.square + other.square,
             self.rays + other.rays,
-            self.listed + other.listed,
-            self.visible + other.visible,
+            listed=self.listed + other.listed,
+            visible=self.visible + other.visible,
         )
 
 
@@ -111,7 +111,7 @@ class BatchSource:
             batch = self.bank.batch(index)
         active = dr.arange(mi.UInt32, dr.width(index)) < limit
         ends = self.ends(batch.depth)
-        rays = Rays(batch.origin, batch.direction, ends, jitter, active)
+        rays = Rays(batch.origin, batch.direction, ends, jitter=jitter, active=active)
         dr.eval(batch, rays, shade, random)
         return Draw(index, batch, rays, shade)
 

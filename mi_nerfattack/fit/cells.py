@@ -88,8 +88,8 @@ def cells_near_surfaces(
         mi.Point3f(*lower.tolist()),
         mi.Vector3f(*scale.tolist()),
         mi.Vector3f(*map(float, shape)),
-        mi.Float(field.step_m),
-        mi.Float(field.cone),
+        step_m=mi.Float(field.step_m),
+        cone=mi.Float(field.cone),
     )
     cells = dr.zeros(dr.uint8_array_t(mi.Float), int(np.prod(shape)))
     for eye, rays in views:

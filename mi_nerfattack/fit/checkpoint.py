@@ -58,7 +58,7 @@ class FitCheckpoint:
         self.elapsed_s = 0.0
         self.history: list[FitProgress] = []
         identity = {"format": FORMAT, **versions(), "fit": _digest(training)}
-        self._unit = Unit(path, identity, FitRecord, _REMEDY)
+        self._unit = Unit(path, identity, FitRecord, remedy=_REMEDY)
         content = None if anew else self._unit.read()
         if content is not None:
             check_entries(path, content.tensors, training.tensors())

@@ -90,8 +90,8 @@ def fit_ngp(
     )
     if images.channels == 4 or not options.sky:
         ngp.set_parameter("sky", dr.full(mi.Float, _BLACK, dr.width(ngp.sky)))
-    training = Training(ngp, images, options, depth)
-    return _run(training, progress, checkpoint, anew)
+    training = Training(ngp, images, options, depth=depth)
+    return _run(training, progress, checkpoint, anew=anew)
 
 
 def fit_grid(
@@ -137,8 +137,8 @@ def fit_grid(
     grid = GridField(
         layout or GridLayout(), low, high, density_scale=1 / float((high - low).max())
     )
-    training = Training(grid, images, options, depth, box_only=True)
-    return _run(training, progress, checkpoint, anew)
+    training = Training(grid, images, options, depth=depth, box_only=True)
+    return _run(training, progress, checkpoint, anew=anew)
 
 
 def fit_object(
@@ -204,7 +204,7 @@ def _run(
         checkpoint.save(clock.elapsed, clock.history)  # scoring may be interrupted
     training.finish()
     scores = evaluate(
-        training.field, training.images, training.held_out, training.depth
+        training.field, training.images, training.held_out, depth=training.depth
     )
     poses = training.images.camera_to_world[training.fitted]
     return FitResult(

@@ -152,7 +152,7 @@ def seen_cells(
     count = np.zeros(len(points), np.int32)
     clear = np.ones(len(points), bool)
     for index, near in zip(indices, _nearest(images, indices), strict=True):
-        count += _in_view(images, int(index), points, radius)
+        count += _in_view(images, int(index), points, radius=radius)
         eye = images.camera_to_world[index, :3, 3].astype(np.float32)
         before = np.nonzero(((points - eye) ** 2).sum(1) < (_CLEAR * near) ** 2)[0]
         back = _BACK * near

@@ -138,7 +138,9 @@ class RayBank:
         if self._depth is not None:
             depth = dr.gather(mi.Float, self._depth, index)
         colour = mi.Color3f(*values[:3])
-        return RayBatch(origin, direction, colour, alpha, depth, image)
+        return RayBatch(
+            origin, direction, colour, alpha=alpha, depth=depth, image=image
+        )
 
     def _rays(self, index: Any) -> tuple[Any, Any, Any]:
         image, pixel, width = self._place(index)
@@ -149,7 +151,7 @@ class RayBank:
         origin, columns = self.corrections.move(image, origin, columns)
         lens = self._lens.of(image)
         rotation = (columns[0], columns[1], columns[2])
-        return image, *lens_rays(lens, origin, rotation, position)
+        return image, *lens_rays(lens, origin, rotation, position=position)
 
     def _place(self, index: Any) -> tuple[Any, Any, Any]:
         """Return the image of pixels, their place in it by rows, and its width."""

@@ -173,9 +173,11 @@ class FieldRenderer:
         psnr, ssim = compare(shown.image, expected, mask)
         holes = float("nan")
         if depth is not None:
-            holes = self.holes(shown, camera, camera_to_world, depth)
+            holes = self.holes(shown, camera, camera_to_world, depth=depth)
         pictures = Pictures(expected, shown, depth)
-        return ViewScore(name, psnr, ssim, shown.hazy, holes, pictures=pictures)
+        return ViewScore(
+            name, psnr, ssim, hazy=shown.hazy, holes=holes, pictures=pictures
+        )
 
     def holes(
         self,
@@ -247,7 +249,7 @@ def evaluate(
             images.names[index],
             images.camera_of(index),
             images.camera_to_world[index],
-            reference(images, index),
+            expected=reference(images, index),
             depth=None if depth is None else depth[index],
             mask=None if images.masks is None else images.masks[index],
         )

@@ -79,18 +79,20 @@ class Training:
         learn = [EXPOSURE] * options.exposure + [POSES] * options.poses
         self.cameras = CameraCorrections(len(self.fitted), learn)
         box = (radiance_field.lower, radiance_field.upper) if box_only else None
-        bank = RayBank(images, self.fitted, depth, box, self.cameras)
+        bank = RayBank(images, self.fitted, depth, box=box, corrections=self.cameras)
         self.pixels = bank.count
         self.occupancy = RunningOccupancy(
             radiance_field, self._allowed(depth), options.seed
         )
         sky = options.sky and not bank.has_alpha
-        source = BatchSource(bank, options.loss, radiance_field, sky)
+        source = BatchSource(bank, options.loss, radiance_field, sky=sky)
         self._march: MarchStep | PointStep = MarchStep(radiance_field, source)
         on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
         if isinstance(radiance_field, NGPField) and on_cpu:
             room = options.samples
-            self._march = PointStep(radiance_field, source, _LISTED * room, room)
+            self._march = PointStep(
+                radiance_field, source, _LISTED * room, visible=room
+            )
         elif options.loss.spread > 0:
             raise InputError("spread: only an NGP on a CPU (LLVM) is fitted with it")
         self.optimiser = mi.ad.Adam(
@@ -114,7 +116,9 @@ class Training:
         is_grid = isinstance(self.field, GridField)
         shape = (n, n, n) if is_grid else grid_shape(lower, upper, n)
         if depth is None or any(np.isnan(depth[i]).any() for i in self.fitted):
-            cells = seen_cells(self.images, self.fitted, lower, upper, shape)
+            cells = seen_cells(
+                self.images, self.fitted, lower, upper=upper, shape=shape
+            )
             if not cells.any():
                 raise InputError(
                     f"bounds: {lower.tolist()} to {upper.tolist()}; no two images see "
@@ -205,7 +209,9 @@ class Training:
                 self.field.step_m / 2
             )  # for the thinner shell that is left
             least, seed = self.options.min_weight, self.options.seed
-            shown = seen_matter(self.field, self.images, self.fitted, least, seed)
+            shown = seen_matter(
+                self.field, self.images, self.fitted, min_weight=least, seed=seed
+            )
             self.field.occupy(Occupancy(shown))
         else:
             cells = self.field.window.cells

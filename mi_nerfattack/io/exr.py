@@ -58,7 +58,7 @@ def write_layers(
                 raise InputError(f"{path}: channel {channel!r} twice; rename a layer")
             channels[channel] = values
     for channel, values in channels.items():
-        channels[channel] = _encode(path, channel, values, half, channels)
+        channels[channel] = _encode(path, channel, values, half=half, names=channels)
     shapes = sorted({values.shape for values in channels.values()})
     if len(shapes) != 1 or 0 in shapes[0]:
         raise InputError(f"{path}: layers of shapes {shapes}; all need one (H, W)")

@@ -65,9 +65,11 @@ def set_keys(name: str, text: str, settings: Sequence[str]) -> str:
             if isinstance(part, str) and isinstance(table, dict):
                 table = table.setdefault(part, tomlkit.table())
             else:
-                table = _item(table, part, name, setting)
+                table = _item(table, part, name, setting=setting)
         if not isinstance(table, dict):
-            _item(table, last, name, setting)  # only elements that are there are set
+            _item(
+                table, last, name, setting=setting
+            )  # only elements that are there are set
         elif isinstance(last, int):
             raise InputError(f"--set {setting}: {last} is no key; name one")
         table[last] = _value(setting, raw)

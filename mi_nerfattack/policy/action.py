@@ -205,7 +205,7 @@ class Action:
             InputError: another shape, or a value that is not finite.
         """
         if self.trajectory is None:
-            controls = columns_of(values, count, self.output, name)
+            controls = columns_of(values, count, self.output, name=name)
             if isinstance(self.scale, tuple):
                 return controls * controls.new_tensor(self.scale)
             return self.scale * controls

@@ -158,7 +158,9 @@ class TorchPolicy(AbstractPolicy):
     def vjp(self, image: Any, goal: Any, cotangent: Any) -> tuple[Any, Any]:
         """Evaluate the module and its reverse derivative on first images."""
         memory = self.initial_memory(len(image))
-        control, (d_image, *_) = self._pull_back(image, goal, memory, cotangent, ())
+        control, (d_image, *_) = self._pull_back(
+            image, goal, memory, cotangent=cotangent, d_memory=()
+        )
         return to_controls(control, image), to_tensor(d_image, image)
 
     def initial_memory(self, count: int) -> Memory:

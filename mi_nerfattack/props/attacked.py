@@ -249,7 +249,7 @@ def placed(attack: FoundAttack) -> tuple[list[Pose], Views]:
     ]
     states = np.concatenate([np.zeros((0, 3)), *driven])
     matrices, period = mount_matrix(states, mount), scenario.vehicle.dt_s
-    return poses, Views(camera, mount, matrices, period)
+    return poses, Views(camera, mount, matrices, period=period)
 
 
 def box_pictures(

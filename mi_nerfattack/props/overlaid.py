@@ -96,6 +96,6 @@ def overlaid_by(run: Path, body: str) -> Overlaid:
     ) -> AbstractCamera:
         box, _ = read_box(run)
         overlay = Overlay(box, camera.camera, keyed=False)
-        return OverlaidCamera(camera, overlay, tracker, body, mount)
+        return OverlaidCamera(camera, overlay, tracker, body=body, mount=mount)
 
     return overlaid

@@ -141,7 +141,7 @@ class Overlay:
             cover *= self._lengths[part] <= near[part] * w
         total[part] += cover
         scale = float(stretch[stretch.shape[0] // 2, stretch.shape[1] // 2])
-        picture, number, way = self._footprint(face, matrix, rows, scale)
+        picture, number, way = self._footprint(face, matrix, rows, scale=scale)
         steps = rows[:, :2] @ way
         probes: list[Any] = [np.float32(0)]
         if number > 1:

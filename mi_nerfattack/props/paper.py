@@ -107,13 +107,17 @@ def _tiled(net: Net, width: float, height: float) -> Sheets | None:
     left = bounds.left + (bounds.width - columns * step_x - _OVERLAP) / 2
     top = bounds.top - (bounds.height - rows * step_y - _OVERLAP) / 2
     tiles = [
-        Tile(c, r, Rectangle(left + c * step_x, top - r * step_y - high, across, high))
+        Tile(
+            c,
+            r,
+            Rectangle(left + c * step_x, top - r * step_y - high, across, height=high),
+        )
         for r in range(rows)
         for c in range(columns)
     ]
     drawn = [*net.faces.values(), *(Rectangle.around(tab.outline) for tab in net.tabs)]
     used = [t for t in tiles if any(part.common(t.part) for part in drawn)]
-    return Sheets(width, height, columns, rows, tuple(used))
+    return Sheets(width, height, columns, rows=rows, tiles=tuple(used))
 
 
 def write_net(
@@ -149,7 +153,9 @@ def write_net(
     metadata = {"Title": f"{box.name}, run {box.run}", "CreationDate": None}
     buffer = io.BytesIO()
     with matplotlib.rc_context(RC), PdfPages(buffer, metadata=metadata) as pdf:
-        for done, page in enumerate(pages(box, net, sheets, edges_mm, dpi), 1):
+        for done, page in enumerate(
+            pages(box, net, sheets, edges_mm=edges_mm, dpi=dpi), 1
+        ):
             pdf.savefig(page)
             on_page(done, total)
     files.write_bytes(path, buffer.getvalue())
@@ -166,7 +172,7 @@ def pages(
         f"{dpi} dpi, sRGB"
     )
     if len(sheets.tiles) > 1:
-        yield _overview(box, net, sheets, description)
+        yield _overview(box, net, sheets, description=description)
     for tile in sheets.tiles:
         yield _page(box, net, sheets, tile=tile, dpi=dpi, description=description)
 
@@ -175,18 +181,23 @@ def _page(
     box: AttackedBox, net: Net, sheets: Sheets, tile: Tile, dpi: int, description: str
 ) -> Figure:
     part = tile.part
-    place = Rectangle(_MARGIN, _MARGIN + _FOOTER, part.width, part.height)
+    place = Rectangle(_MARGIN, _MARGIN + _FOOTER, part.width, height=part.height)
     figure, axes = _sheet(sheets, place, part)
     shown = []
     for face, rectangle in net.faces.items():
         common = rectangle.common(part)
         if common is not None:
             shown.append(face)
-            _paint(axes, box.images[face], rectangle, common, dpi)
+            _paint(axes, box.images[face], rectangle, part=common, dpi=dpi)
     _draw_lines(axes, net)
-    _mark_neighbours(figure, sheets, tile, place)
+    _mark_neighbours(figure, sheets, tile, place=place)
     where = f"page {tile.name} of A1 to {_last(sheets)}; " * (len(sheets.tiles) > 1)
-    _foot(figure, sheets, f"{where}faces: {', '.join(shown) or 'none'}", description)
+    _foot(
+        figure,
+        sheets,
+        f"{where}faces: {', '.join(shown) or 'none'}",
+        description=description,
+    )
     return figure
 
 
@@ -263,27 +274,27 @@ def _mark_neighbours(
         if x is not None:
             spans = (place.top, place.top + tick), (place.bottom - tick, place.bottom)
             for low, high in spans:
-                _line(figure, sheets, (x, x), (low, high))
-            _text(figure, sheets, x + 1, place.top + 2, f"cut or lay on {other}")
+                _line(figure, sheets, (x, x), ys=(low, high))
+            _text(figure, sheets, x + 1, y=place.top + 2, text=f"cut or lay on {other}")
         elif y is not None:
             spans = (place.left - tick, place.left), (place.right, place.right + tick)
             for low, high in spans:
-                _line(figure, sheets, (low, high), (y, y))
+                _line(figure, sheets, (low, high), ys=(y, y))
             note = f"cut or lay on {other}"
-            _text(figure, sheets, place.left - 4, y + 1, note, rotation=90)
+            _text(figure, sheets, place.left - 4, y=y + 1, text=note, rotation=90)
 
 
 def _foot(figure: Figure, sheets: Sheets, where: str, description: str) -> None:
     """Draw a ruler of 100 mm and the small print."""
     base = _MARGIN + 3
-    _line(figure, sheets, (_MARGIN, _MARGIN + 100), (base, base))
+    _line(figure, sheets, (_MARGIN, _MARGIN + 100), ys=(base, base))
     for centimetre in range(11):
         x, rise = _MARGIN + 10 * centimetre, 3.0 if centimetre % 5 == 0 else 1.5
-        _line(figure, sheets, (x, x), (base, base + rise))
+        _line(figure, sheets, (x, x), ys=(base, base + rise))
     note = "100 mm: measure; print at 100 %, not fitted to the page"
-    _text(figure, sheets, _MARGIN, _MARGIN - 0.5, note)
-    _text(figure, sheets, _MARGIN + 104, _MARGIN + 3.5, where)
-    _text(figure, sheets, _MARGIN + 104, _MARGIN - 0.5, description)
+    _text(figure, sheets, _MARGIN, y=_MARGIN - 0.5, text=note)
+    _text(figure, sheets, _MARGIN + 104, y=_MARGIN + 3.5, text=where)
+    _text(figure, sheets, _MARGIN + 104, y=_MARGIN - 0.5, text=description)
 
 
 def _overview(box: AttackedBox, net: Net, sheets: Sheets, description: str) -> Figure:
@@ -294,8 +305,8 @@ def _overview(box: AttackedBox, net: Net, sheets: Sheets, description: str) -> F
     height = max(p.top for p in rectangles) - bottom
     room = sheets.width - 2 * _MARGIN, sheets.height - 2 * _MARGIN - _FOOTER
     scale = min(room[0] / width, room[1] / height)
-    place = Rectangle(_MARGIN, _MARGIN + _FOOTER, scale * width, scale * height)
-    figure, axes = _sheet(sheets, place, Rectangle(left, bottom, width, height))
+    place = Rectangle(_MARGIN, _MARGIN + _FOOTER, scale * width, height=scale * height)
+    figure, axes = _sheet(sheets, place, Rectangle(left, bottom, width, height=height))
     for face, spot in net.faces.items():
         small = Image.fromarray(box.images[face]).resize(_THUMBNAIL_PX)
         extent = spot.left, spot.right, spot.bottom, spot.top
@@ -313,12 +324,12 @@ def _overview(box: AttackedBox, net: Net, sheets: Sheets, description: str) -> F
         axes.text(part.left, part.top, f" {tile.name}", fontsize=6, va="top")
     count = len(sheets.tiles)
     where = f"reduced: how {count} pages, A1 to {_last(sheets)}, lie side by side"
-    _foot(figure, sheets, where, description)
+    _foot(figure, sheets, where, description=description)
     return figure
 
 
 def _last(sheets: Sheets) -> str:
-    return Tile(sheets.columns - 1, sheets.rows - 1, Rectangle(0, 0, 0, 0)).name
+    return Tile(sheets.columns - 1, sheets.rows - 1, Rectangle(0, 0, 0, height=0)).name
 
 
 def _line(

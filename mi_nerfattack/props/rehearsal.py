@@ -185,7 +185,7 @@ class SimulatedPilot(AbstractPilot):
         except InputError as err:
             raise DeviceLostError(f"policy: {err}") from err
         then = self._room.now_s + DECISION_S
-        self._decisions.append(Decision(value, frame.index, frame.time_s, then))
+        self._decisions.append(Decision(value, frame.index, frame.time_s, time_s=then))
 
     def newest(self) -> Decision | None:
         """Return the newest decision whose time has come."""
@@ -303,7 +303,7 @@ def open_rehearsal(
     tracker, motor = SimulatedTracker(room), SimulatedMotor(room)
     with closing(simulated_camera(room, place, config.spp)) as camera, closing(motor):
         shown = overlaid(camera, tracker, mount) if overlaid else camera
-        begin = begin_control(config, route, trained.policy, tracker)
+        begin = begin_control(config, route, trained.policy, tracker=tracker)
         pilot, enable = SimulatedPilot(begin, room), SimulatedEnable(room)
-        devices = Devices(shown, tracker, motor, pilot, enable)
+        devices = Devices(shown, tracker, motor, pilot=pilot, enable=enable)
         yield Rig(devices, room.clock, room.sleep, room.clock, mount)

@@ -122,7 +122,7 @@ class AbstractComposite(ABC):
                 layers where it depends on the total alone.
             stop: as given to :meth:`render`.
         """
-        for task in self.tasks(posed, rays, primal, cotangent):
+        for task in self.tasks(posed, rays, primal, cotangent=cotangent):
             self.accumulate([posed[k] for k in task.fields], task, stop)
 
     @abstractmethod
@@ -244,7 +244,11 @@ class DepthComposite(AbstractComposite):
             for k, item in enumerate(posed)
             if item.has_gradients
             for task in select(
-                primal.layers[k].opacity > 0, rays, primal.layers[k], by_layer[k], (k,)
+                primal.layers[k].opacity > 0,
+                rays,
+                primal.layers[k],
+                cotangent=by_layer[k],
+                which=(k,),
             )
         ]
 

@@ -111,7 +111,9 @@ class InterleavedComposite(AbstractComposite):
             return []
         mask = reduce(operator.or_, met)
         d_total = _total_cotangent(primal, cotangent)
-        return select(mask, rays, primal.total, d_total, tuple(range(len(posed))))
+        return select(
+            mask, rays, primal.total, cotangent=d_total, which=tuple(range(len(posed)))
+        )
 
     def accumulate(self, posed: Sequence[Layer], task: Task, stop: float) -> None:
         """See :meth:`AbstractComposite.accumulate`."""

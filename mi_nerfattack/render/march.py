@@ -168,7 +168,7 @@ def integrate(
         # The next lattice interval in an occupied cell, and one sample in it
         walk, segment = walk.next(posed, active)
         points = [path.at(segment.t) for path in walk.paths]
-        densities, colours = _evaluate(evaluate, points, towards, segment)
+        densities, colours = _evaluate(evaluate, points, towards, segment=segment)
         # A.1 to A.3 as sums: T phi(x) x L, and the same of 1 and of t
         sums = sums.plus(segment.depths(densities), colours, segment.t)
         # Behind transmittance `stop`, nothing is seen
@@ -204,7 +204,7 @@ class RayGradient:
             self.origin + by_point,
             self.direction + segment.t * by_point,
             self.heading + by_heading,
-            self.log_density + dr.select(segment.active, growth, 0),
+            log_density=self.log_density + dr.select(segment.active, growth, 0),
         )
 
     def in_world(self, posed: PosedField, path: Path) -> RayGradient:
@@ -253,7 +253,7 @@ def replay(  # noqa: D417  one entry describes four
             # The fields again at the sample, attached to their parameters
             points, headings = _attach(walk.paths, segment.t, with_rays)
             densities, colours = _evaluate(
-                [item.eval for item in posed], points, headings, segment
+                [item.eval for item in posed], points, headings, segment=segment
             )
             # dI/dL = w, dI/dsigma = width (T L - what is behind): see
             # `sums.Remainder.minus`

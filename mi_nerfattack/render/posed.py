@@ -259,7 +259,7 @@ class PosedField:
         """Intersect a local ray with the bounding box, clipped to [0, t_max]."""
         lower = mi.Point3f(*map(float, self.field.lower))
         upper = mi.Point3f(*map(float, self.field.upper))
-        near, far = meet_box(o, d, lower, upper)
+        near, far = meet_box(o, d, lower, upper=upper)
         return dr.maximum(near, 0), dr.minimum(far, t_max)
 
     def lattice(self, index: mi.Float) -> mi.Float:

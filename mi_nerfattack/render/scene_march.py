@@ -131,7 +131,7 @@ class FieldMarch(AbstractSceneMarch):
 
     def _march(self, rays: Rays, clear: mi.Float) -> March:
         (posed,) = rays.light([self.posed])
-        return march(posed, rays, self.stop, clear)
+        return march(posed, rays, self.stop, clear=clear)
 
     def _state(self, rays: Rays, last: mi.UInt32) -> list[Any]:
         del last

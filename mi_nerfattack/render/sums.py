@@ -112,7 +112,7 @@ class Remainder:
     def of(primal: March) -> Remainder:
         """Return all of a march."""
         radiance, moment = mi.Color3f(primal.radiance), mi.Float(primal.moment)
-        return Remainder(mi.Float(0), radiance, moment, 1 - primal.opacity)
+        return Remainder(mi.Float(0), radiance, moment, passed=1 - primal.opacity)
 
     def minus(
         self, depths: Sequence[mi.Float], colours: Sequence[mi.Color3f], t: mi.Float
@@ -128,7 +128,7 @@ class Remainder:
             self.tau + x,
             self.radiance - attenuation * light,
             self.moment - attenuation * x * t,
-            self.passed,
+            passed=self.passed,
         )
         # More depth in any field dims the sample's own light, and all light behind it.
         d_radiance = through * d_phi * light - remainder.radiance

@@ -60,7 +60,7 @@ class Path:
         # The path begins at the last lattice point before the box
         first = dr.select(meets, dr.floor(posed.lattice_index(near)), 0)
         begin = posed.lattice(first)
-        path = Path(o + begin * d, d, dr.normalize(d), begin, first)
+        path = Path(o + begin * d, d, dr.normalize(d), begin=begin, first=first)
         near, far = near - begin, far - begin
         if not posed.field.window.is_open:
             # Density falls to 0 at the box. Whole intervals around it leave no edge
@@ -177,7 +177,7 @@ def seek(
         searching &= ~hit
         # Otherwise the search jumps over the empty block, by one interval at least
         rate = posed.field.unit_vector(path.d)
-        leaving = s + occupancy.exit(unit, rate, cell, distance)
+        leaving = s + occupancy.exit(unit, rate, cell, distance=distance)
         jump = dr.maximum(index + 1, path.interval(posed, leaving))
         index = dr.select(searching, jump, index)
     return index, path.begin + s, dr.maximum(width, 0), hit
@@ -243,7 +243,7 @@ class MergedWalk:
         """Return rays before their first segment, and those that may have one."""
         paths = [Path.of(item, rays) for item in posed]
         cursors = [Cursor.before(path) for path in paths]
-        walk = MergedWalk(paths, rays.jitter, cursors, mi.Float(0))
+        walk = MergedWalk(paths, rays.jitter, cursors, t=mi.Float(0))
         return walk, mi.Bool(rays.active)
 
     def next(
@@ -272,7 +272,7 @@ class MergedWalk:
         width = dr.select(active, end - begin, 0)
         sample = dr.select(active, begin + self.jitter * width, 0)
         t = dr.select(active, end, self.t)
-        walk = MergedWalk(self.paths, self.jitter, cursors, t)
+        walk = MergedWalk(self.paths, self.jitter, cursors, t=t)
         return walk, Segment(sample, width, active, inside)
 
 
@@ -371,8 +371,8 @@ def _follow(
         going &= dr.all(dr.abs(dr.floor(lower * shape) - cell) < distance)
         going &= dr.all(dr.abs(dr.floor(upper * shape) - cell) < distance)
         # Up to where one of them leaves it
-        first = occupancy.exit(mi.Point3f(lower), rate.lower, cell, distance)
-        other = occupancy.exit(mi.Point3f(upper), rate.upper, cell, distance)
+        first = occupancy.exit(mi.Point3f(lower), rate.lower, cell, distance=distance)
+        other = occupancy.exit(mi.Point3f(upper), rate.upper, cell, distance=distance)
         way = dr.select(going, dr.minimum(first, other), 0)
         t += way
         going &= (way > least) & (t < dr.inf)

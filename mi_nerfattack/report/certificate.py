@@ -36,7 +36,7 @@ def robustness_table(document: Mapping[str, Any]) -> Table:
         f"{document['coefficients']} coefficients, {settings['environment']}"
     )
     label = Column("radius", "radius")
-    return Table(title, [label], figures, [centre, *document["rows"]])
+    return Table(title, [label], figures, records=[centre, *document["rows"]])
 
 
 def gradient_table(document: Mapping[str, Any]) -> Table:
@@ -51,7 +51,7 @@ def gradient_table(document: Mapping[str, Any]) -> Table:
     ]
     title = f"Real by predicted changes along {document['directions']} directions"
     label = Column("horizon (s)", lambda row: f"{row['time_s']:g}")
-    return Table(title, [label], figures, document["rows"])
+    return Table(title, [label], figures, records=document["rows"])
 
 
 #: A dash where neither the gradient nor the drives change the objective.

@@ -118,7 +118,7 @@ class Table:
     @staticmethod
     def of(records: Iterable[Any], columns: Sequence[Column]) -> Table:
         """Make a table without a title; the first column is the label."""
-        return Table("", columns[:1], columns[1:], list(records))
+        return Table("", columns[:1], columns[1:], records=list(records))
 
     @property
     def shown(self) -> list[Column]:

@@ -82,7 +82,7 @@ def _trajectory(trajectory: Trajectory) -> bytes:
 @draw.register
 def _field(field: GridField) -> bytes:
     """Render the object from four sides, over white."""
-    around = Around(field.lower, field.upper, _AZIMUTHS_DEG, _EDGE_PX)
+    around = Around(field.lower, field.upper, _AZIMUTHS_DEG, edge_px=_EDGE_PX)
     views = [over_paper(*view) for view in around.views(field)]
     return _encoded((255 * np.concatenate(views, axis=1)).round().astype(np.uint8))
 

@@ -50,7 +50,9 @@ class AbstractAdjoint(ABC):
             TypeError: sensor or policy have no such derivatives.
         """
         visits = self.visit(loop, drive)
-        return backward(loop, drive, visits, cost.by_states(drive), options)
+        return backward(
+            loop, drive, visits, d_states=cost.by_states(drive), options=options
+        )
 
 
 @dataclass(frozen=True)

@@ -176,7 +176,7 @@ class Rollout:
             TypeError: there are no such derivatives.
         """
         cost = Cost(self.objective, self.reduction, scale)
-        options = Options(self.attached, extra_keys, recorder, on_step)
+        options = Options(self.attached, extra_keys, recorder, on_step=on_step)
         drive = evaluation.trajectory
         return self.adjoint.gradient(self.loop, drive, cost, options)
 
@@ -191,7 +191,9 @@ class Rollout:
             steps: control periods.
         """
         d_states = Cost(self.objective, self.reduction).by_states(drive)
-        return backward_to_images(self.loop, drive, d_states, steps, self.attached)
+        return backward_to_images(
+            self.loop, drive, d_states, steps=steps, attached=self.attached
+        )
 
     def __call__(self, values: Mapping[str, Any], initial: Any) -> Any:
         """Evaluate J as one differentiable operation of Dr.Jit.

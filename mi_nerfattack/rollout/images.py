@@ -197,7 +197,9 @@ def _observation(
         pixels = dr.ravel(_develop(linear))
         dr.eval(pixels)
     image = mi.TensorXf(pixels, (count, height, width, 3))
-    return Observation(image, step, linear, integrator_state, view)
+    return Observation(
+        image, step, linear, integrator_state=integrator_state, view=view
+    )
 
 
 def _develop(linear: mi.Color3f) -> mi.Color3f:

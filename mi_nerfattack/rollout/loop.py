@@ -78,7 +78,11 @@ class ClosedLoop:
 
     def __post_init__(self) -> None:
         transition = Transition(
-            self.dynamics, self.integrator, self.dt, self.substeps, self.delay
+            self.dynamics,
+            self.integrator,
+            self.dt,
+            substeps=self.substeps,
+            delay=self.delay,
         )
         object.__setattr__(self, "transition", transition)
 
@@ -132,7 +136,9 @@ class ClosedLoop:
     def _number_rows(self, state: Any, step: int) -> list[Any]:
         """Return the numbers as rows (n,), differentiable in the state (m, n)."""
         speed = self.dynamics.speed_of(state) if self.policy.numbers.speed else None
-        return numbers_of(self.policy.numbers, state, speed, step * self.dt, self.route)
+        return numbers_of(
+            self.policy.numbers, state, speed, time=step * self.dt, route=self.route
+        )
 
     def shown(self, observation: Observation, step: int) -> Any:
         """Return the image that the policy gets, (n, height, width, 3), evaluated."""

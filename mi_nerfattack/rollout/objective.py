@@ -279,7 +279,7 @@ class Cost:
         history = drive.history()
 
         def cost(rows: Any) -> Any:
-            states = StateHistory(rows, history.count, history.horizon, history.dt)
+            states = StateHistory(rows, history.count, history.horizon, dt=history.dt)
             return self.reduction.reduce(self.objective.evaluate(states))
 
         by_rows = np.array(vjp(cost, history.rows, self.scale), np.float64)

@@ -83,7 +83,7 @@ class SceneSensor(AbstractDifferentiableSensor):
         self._images = SceneImages(scene, self.integrator)
         if isinstance(sensor, int):
             sensor = sensor_of(scene, sensor)
-        camera = SceneCamera(sensor, mount or CameraMount(), seed, centred)
+        camera = SceneCamera(sensor, mount or CameraMount(), seed, centred=centred)
         self.cameras: tuple[SceneCamera, ...] = (camera,)
         self.names: tuple[str, ...] = (ONLY,)
         self._parameters = Differentiated(scene, self._images.collector)

@@ -223,7 +223,7 @@ def _built_in(field: GridField, pose: Pose) -> BuiltInObject:
     key = array_digest([*values, *field.occupancy_tensors().values()])
     looks = _BUILT.setdefault(field, {})
     built = looks.pop(key, None) or paint(_shell(field), field, pose)
-    _remember(looks, key, built, _LOOKS)
+    _remember(looks, key, built, most=_LOOKS)
     return replace(built, pose=pose)
 
 
@@ -233,7 +233,7 @@ def _shell(field: GridField) -> Shell:
     arrays = array_digest([density, *field.occupancy_tensors().values()])
     key = json_digest([arrays, field.metadata()])
     shell = _SHELLS.pop(key, None) or shell_of(field)
-    _remember(_SHELLS, key, shell, _MAX_SHELLS)
+    _remember(_SHELLS, key, shell, most=_MAX_SHELLS)
     return shell
 
 
@@ -258,6 +258,10 @@ def deployments(sections: DeploymentSections, place: Place) -> Mapping[str, Depl
         conditions = Conditions(**{n: values[n] for n in names if n in values})
         builds_in, there = values.get("objects") == "built-in", section.place(place)
         by_label[label] = Deployment(
-            section.kind, there, conditions, builds_in, section.settings
+            section.kind,
+            there,
+            conditions,
+            builds_in=builds_in,
+            settings=section.settings,
         )
     return by_label

@@ -271,7 +271,7 @@ def build_surrogate(scenario: Scenario) -> SceneSensor:
     names = [item.id for item in scenario.objects]
     if place.surrogate is not None:
         xml = load_scene(place.surrogate.file)
-        sensor = scene_sensor(xml, rig.mounts[0], names, scenario.seed)
+        sensor = scene_sensor(xml, rig.mounts[0], names, seed=scenario.seed)
         if scenario.attack.attached:
             try:
                 sensor.check_attached()

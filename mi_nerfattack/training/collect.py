@@ -123,7 +123,7 @@ class _Shards(AbstractWork):
 
     def unit(self, path: Path) -> Unit[ShardRecord]:
         """Return what a file must be."""
-        return Unit(path, self.identity, ShardRecord, _REMEDY)
+        return Unit(path, self.identity, ShardRecord, remedy=_REMEDY)
 
     def open(self) -> _Opened:
         """Load what staging and source need."""
@@ -152,7 +152,7 @@ class _Shards(AbstractWork):
         images = np.stack([row.image for row in rows])
         controls = np.array([row.control for row in rows])
         self.unit(self.path(index)).write(
-            shard_columns(images, goals, controls, self._states(numbers, rows)),
+            shard_columns(images, goals, controls, states=self._states(numbers, rows)),
             ShardRecord(
                 conditions=asdict(conditions),
                 goals=_counts(goals),

@@ -89,7 +89,7 @@ class Scenery:
         state = self.environment.state
         controls = self.expert.control(state)
         control = float(controls[0]) if controls.ndim == 1 else controls[0]
-        return Labelled(image, control, np.array(state[:3], np.float64), step)
+        return Labelled(image, control, np.array(state[:3], np.float64), step=step)
 
     @property
     def strayed(self) -> bool:

@@ -175,7 +175,7 @@ class _Run:
         self.checkpoint: Unit[TrainRecord] | None = None
         if checkpoint is not None:
             path = Path(checkpoint)
-            self.checkpoint = Unit(path, self._identity(), TrainRecord, _REMEDY)
+            self.checkpoint = Unit(path, self._identity(), TrainRecord, remedy=_REMEDY)
 
     def epoch(self, epoch: int, progress: Callable[[Progress], None] | None) -> float:
         """Pass over the rows once, in an order that depends on seed and epoch."""
@@ -201,7 +201,7 @@ class _Run:
                     f"lower learning_rate = {self.settings.learning_rate}"
                 )
             if progress is not None:
-                progress(Progress(epoch + 1, step + 1, self.steps, losses[-1]))
+                progress(Progress(epoch + 1, step + 1, self.steps, loss=losses[-1]))
         return float(np.mean(losses))
 
     @torch.no_grad()

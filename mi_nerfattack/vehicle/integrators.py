@@ -153,16 +153,16 @@ class ImplicitMidpoint(AbstractIntegrator):
         x_prev, control = dr.detach(x), dr.detach(u)
         x_next = type(x_prev)(x_prev)  # an Euler step overshoots in stiff models
         for _ in range(self.iterations):
-            defect = self.residual(dynamics, x_prev, x_next, control, dt)
-            columns = self._jacobian(dynamics, x_prev, x_next, control, dt)
+            defect = self.residual(dynamics, x_prev, x_next, u=control, dt=dt)
+            columns = self._jacobian(dynamics, x_prev, x_next, u=control, dt=dt)
             x_next = x_next - solve_columns(columns, defect)
         if not dr.grad_enabled(x, u):
             return x_next
         # One more iteration with a constant Jacobian: the value stays, and its
         # derivative is that of the implicit function, -(dG/dx)^-1 dG/d(x_prev, u).
-        columns = self._jacobian(dynamics, x_prev, x_next, control, dt)
+        columns = self._jacobian(dynamics, x_prev, x_next, u=control, dt=dt)
         return x_next - solve_columns(
-            columns, self.residual(dynamics, x, x_next, u, dt)
+            columns, self.residual(dynamics, x, x_next, u=u, dt=dt)
         )
 
     def residual(
@@ -187,7 +187,7 @@ class ImplicitMidpoint(AbstractIntegrator):
         """Raise `InputError` unless the residual is a rounding error."""
         dynamics.check(x)
         x_prev, x, u = dr.detach(x_prev), dr.detach(x), dr.detach(u)
-        defect = self.residual(dynamics, x_prev, x, u, dt)
+        defect = self.residual(dynamics, x_prev, x, u=u, dt=dt)
         defect, scale = dr.abs(defect), 1 + dr.abs(x_prev) + dr.abs(x)
         defect, scale = dr.max(defect, axis=0), dr.max(scale, axis=0)
         epsilon = dr.epsilon(type(defect))

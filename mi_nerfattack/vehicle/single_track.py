@@ -192,9 +192,14 @@ class DynamicSingleTrack(AbstractSingleTrack):
         # loads of the axles at rest, and the lateral forces of their tyres
         length = self.front_m + self.rear_m
         load = self.mass * GRAVITY / length
-        front = self._force(rolling, sliding, self.front_stiffness, load * self.rear_m)
+        front = self._force(
+            rolling, sliding, self.front_stiffness, load=load * self.rear_m
+        )
         rear = self._force(
-            along, left - self.rear_m * rate, self.rear_stiffness, load * self.front_m
+            along,
+            left - self.rear_m * rate,
+            self.rear_stiffness,
+            load=load * self.front_m,
         )
         # accelerations along the car, to its left and about the vertical
         driven = longitudinal(along, acceleration, self.stop_speed)

@@ -66,7 +66,7 @@ class TorchDynamics(AbstractUserDynamics):
 
     def evaluate(self, state: torch.Tensor, control: torch.Tensor) -> torch.Tensor:
         """Call the function with (n, m) and (n,) or (n, k), and check its result."""
-        result = call_model(self.name, self.function, state, control)
+        result = call_model(self.name, self.function, state, control=control)
         if not isinstance(result, torch.Tensor) or result.shape != state.shape:
             shape = getattr(result, "shape", None)
             description = type(result).__name__ + (

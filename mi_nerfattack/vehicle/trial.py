@@ -34,7 +34,7 @@ def try_model(name: str, dynamics: AbstractDynamics, limits: Sequence[float]) ->
     states[:, 3:] += 1e-3 * rng.uniform(0.5, 1, (TRIALS, size - 3))
     shares = rng.uniform(0.1, 0.5, (len(limits), TRIALS))
     control = to_control(shares.T * limits)
-    require_model(name, dynamics, to_state(states), control)
+    require_model(name, dynamics, to_state(states), u=control)
 
 
 def require_model(name: str, dynamics: AbstractDynamics, state: Any, u: Any) -> None:
@@ -76,7 +76,7 @@ def require_model(name: str, dynamics: AbstractDynamics, state: Any, u: Any) -> 
                 "finite numbers are needed"
             )
         # A derivative is lost if it is 0 although the central difference is not
-        slope = _difference(dynamics, state, u, j)
+        slope = _difference(dynamics, state, u, row=j)
         lost = (derivative == 0).all(axis=1) & (np.abs(slope) > VISIBLE).any(axis=1)
         if lost.any():
             row = int(np.flatnonzero(lost)[0])

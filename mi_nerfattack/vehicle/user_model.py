@@ -103,7 +103,7 @@ class FunctionDynamics(AbstractUserDynamics):
             InputError: it failed, or returned something else than m rows, one entry a
                 vehicle, or rows that do not depend on the control by Dr.Jit operations.
         """
-        result = call_model(self.name, self.function, state, control)
+        result = call_model(self.name, self.function, state, control=control)
         result = self._rows(result, state)
         if dr.grad_enabled(control) and not dr.grad_enabled(result):
             raise InputError(

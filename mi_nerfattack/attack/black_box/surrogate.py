@@ -121,7 +121,9 @@ class SurrogateSearch(AbstractAttack):
         if objective < self.best_objective:
             self.best_objective, self.best_mean_m = objective, mean
         largest = judged.cross_track_max_m
-        self.history.append(IterationRecord(self.iteration, objective, mean, largest))
+        self.history.append(
+            IterationRecord(self.iteration, objective, mean, cross_track_max_m=largest)
+        )
 
     def curve(self, backward_multiple: float) -> np.ndarray:
         """See ``AbstractAttack.curve``; this attack has no backward pass."""

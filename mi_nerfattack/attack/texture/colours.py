@@ -123,7 +123,7 @@ class Colours(AbstractColouring):
         # A colour of exactly 0 or 1 has no finite logit
         colours = np.clip(vertex_colours(field, self.level), 1e-4, 1 - 1e-4)
         self._allowed = Allowed(
-            constraints or Constraints(), field, self.level, colours
+            constraints or Constraints(), field, self.level, original=colours
         )
         self._raw = _logit(colours)
         self.start: np.ndarray = self._allowed.start

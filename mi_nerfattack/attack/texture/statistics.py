@@ -109,8 +109,8 @@ def texture_statistics(
         float(np.sqrt((weight * (change**2).mean(axis=1)).sum())),
         float(np.abs(change).max()),
         float(min(1, (weight * saturated.mean(axis=1)).sum())),  # weights round
-        _variation(colour, visible, weights),
-        _spectrum(change, visible, weights),
+        total_variation=_variation(colour, visible, weights),
+        spectrum=_spectrum(change, visible, weights),
     )
 
 

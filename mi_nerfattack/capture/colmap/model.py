@@ -84,7 +84,7 @@ def read_colmap(
     image_paths = _find_images(root, model, [record.name for record in records])
     missing = tuple(record.name for record in records if record.name not in image_paths)
     if missing and not skip_missing:
-        _refuse_missing(where, missing, len(records), image_paths)
+        _refuse_missing(where, missing, len(records), image_paths=image_paths)
     used = [record for record in records if record.name in image_paths]
     paths = [image_paths[record.name] for record in used]
     lenses = [cameras[record.camera_id] for record in used]
@@ -92,7 +92,7 @@ def read_colmap(
         [r.quaternion for r in used], [r.translation for r in used]
     )
     require_near(where, poses[:, :3, 3])
-    images, reduced = load_images(paths, lenses, source, long_edge_px)
+    images, reduced = load_images(paths, lenses, source, long_edge_px=long_edge_px)
     return PosedImages(
         images=images,
         camera_to_world=poses,

@@ -161,8 +161,8 @@ def _reconstruct(
         )
         start += len(names)
     _assume_fisheye(pycolmap, database)
-    _match(pycolmap, database, task["matching"], count)
-    models = _map(pycolmap, database, folder, task)
+    _match(pycolmap, database, task["matching"], count=count)
+    models = _map(pycolmap, database, folder, task=task)
     model = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
     if model is None:
         return None

@@ -40,7 +40,7 @@ class Accessors:
         if not 0 <= count * width <= MAX_NUMBERS:
             raise ValueError(f"accessors[{index}].count: {count}")
         if "bufferView" in accessor:
-            rows = self._view(accessor, kind, count, width)
+            rows = self._view(accessor, kind, count, width=width)
         elif "sparse" in accessor:
             rows = np.zeros((count, width), kind)
         else:
@@ -50,7 +50,7 @@ class Accessors:
             places, values = sparse["indices"], sparse["values"]
             number = int(sparse["count"])
             at = self._view(places, np.dtype(_TYPES[places["componentType"]]), number)
-            rows[at[:, 0]] = self._view(values, kind, number, width)
+            rows[at[:, 0]] = self._view(values, kind, number, width=width)
         if kind.kind == "f":
             return rows.astype(np.float64)
         if accessor.get("normalized"):

@@ -81,7 +81,15 @@ def lay_out(corners: np.ndarray, texel_m: float) -> Atlas:
     columns, rows = (offsets[triangles] + local).T
     uv = (offsets[:, None] + flat + _BORDER) / [width, height]
     uv[..., 1] = 1 - uv[..., 1]
-    return Atlas(width, height, uv, rows, columns, triangles, weights)
+    return Atlas(
+        width,
+        height,
+        uv,
+        rows=rows,
+        columns=columns,
+        triangles=triangles,
+        weights=weights,
+    )
 
 
 def _flattened(corners: np.ndarray) -> np.ndarray:

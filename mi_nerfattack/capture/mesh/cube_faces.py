@@ -110,10 +110,10 @@ def render_faces(field: GridField, pixels_per_m: float | None = None) -> CubeFac
         )
     posed = PosedField(field)
     images = {
-        name: _render(posed, lower, upper, scale, axes)
+        name: _render(posed, lower, upper, scale=scale, axes=axes)
         for name, axes in CUBE_FACES.items()
     }
-    return CubeFaces(lower, upper, scale, images)
+    return CubeFaces(lower, upper, scale, images=images)
 
 
 def write_faces(folder: str | Path, faces: CubeFaces) -> None:
@@ -154,7 +154,9 @@ def flat_share(field: GridField) -> float:
     posed, voxel = PosedField(field), _voxel(field)
     good = []
     for axes in [axes for name, axes in CUBE_FACES.items() if name != "nz"]:
-        integrals, distance = _look(posed, lower, upper, axes, (_COARSE_PX, _COARSE_PX))
+        integrals, distance = _look(
+            posed, lower, upper, axes=axes, shape=(_COARSE_PX, _COARSE_PX)
+        )
         opacity, moment = integrals.opacity.numpy(), integrals.moment.numpy()
         depth = moment / np.maximum(opacity, 1e-6)
         flat = np.abs(depth - distance) < _FLAT_VOXELS * voxel
@@ -173,7 +175,7 @@ def _render(
     _, right, up = np.abs(np.array(axes))
     extent = upper - lower
     width, height = (max(1, round(scale * float(v @ extent))) for v in (right, up))
-    integrals, _ = _look(posed, lower, upper, axes, (height, width))
+    integrals, _ = _look(posed, lower, upper, axes=axes, shape=(height, width))
     return straight_rgba(
         integrals.radiance.numpy().T.reshape(height, width, 3),
         integrals.opacity.numpy().reshape(height, width, 1),

@@ -136,7 +136,7 @@ def prepare(
     try:
         tree = parse_json(path, raw.decode("utf-8-sig"))
         accessors = Accessors(tree, load, chunks)
-        colours = _prepare_tree(path, tree, bool(chunks), accessors)
+        colours = _prepare_tree(path, tree, bool(chunks), accessors=accessors)
         place_meshes(path, tree, accessors)
         data = json.dumps(tree).encode()
     except (InputError, SetupError, FileNotFoundError):
@@ -200,7 +200,9 @@ def _prepare_tree(
     for i, mesh in enumerate(tree.get("meshes", ())):
         for j, primitive in enumerate(mesh["primitives"]):
             where = f"{path}: meshes[{i}].primitives[{j}]"
-            _prepare_primitive(where, tree, primitive, colours, accessors)
+            _prepare_primitive(
+                where, tree, primitive, colours=colours, accessors=accessors
+            )
     for i, material in enumerate(materials):
         material["name"] = str(i)
     return colours
@@ -215,7 +217,9 @@ def _base_colour(path: Path, tree: Any, index: int) -> BaseColour:
     cutoff = float(material.get("alphaCutoff", 0.5))
     if info is None:
         plain = ("repeat", "repeat")
-        return BaseColour(False, plain, np.eye(2, 3), cutoff, factor)
+        return BaseColour(
+            False, plain, np.eye(2, 3), alpha_cutoff=cutoff, factor=factor
+        )
     texture = tree["textures"][info["index"]]
     webp = texture.get("extensions", {}).get("EXT_texture_webp", {})
     if webp.get("source", texture.get("source")) is None:
@@ -225,7 +229,9 @@ def _base_colour(path: Path, tree: Any, index: int) -> BaseColour:
         )
     sampler = tree["samplers"][texture["sampler"]] if "sampler" in texture else {}
     wrap = [_WRAPS[sampler.get(name, 10497)] for name in ("wrapS", "wrapT")]
-    return BaseColour(True, (wrap[0], wrap[1]), _matrix(info), cutoff, factor)
+    return BaseColour(
+        True, (wrap[0], wrap[1]), _matrix(info), alpha_cutoff=cutoff, factor=factor
+    )
 
 
 def _base_texture(material: Any) -> Any:

@@ -163,7 +163,7 @@ def normalise(
             neither, the file's unit is taken to be the metre.
     """
     low, high = mesh.bounds
-    scale = extent_scale(mesh.name, high - low, height_m, longest_m)
+    scale = extent_scale(mesh.name, high - low, height_m, longest_m=longest_m)
     offset = np.array([*(-0.5 * (low + high)[:2]), -low[2]])
     return mesh.transformed(scale, offset)
 
@@ -214,7 +214,7 @@ def _mitsuba_shape(part: MeshPart) -> Any:
         colour = colour * np.array(part.colour)  # a texture holds the part's already
     # Mitsuba's bitmaps have their origin at the top left
     uv = None if part.uv is None else part.uv * [1, -1] + [0, 1]
-    arrays = MeshArrays(part.vertices, part.faces, part.normals, uv, colour)
+    arrays = MeshArrays(part.vertices, part.faces, part.normals, uv=uv, colour=colour)
     return make_mesh("part", arrays, mi.load_dict(_material(part)))
 
 

@@ -79,5 +79,5 @@ def read_mesh(shape: Any) -> MeshArrays:
         rows("vertex_positions", 3),
         rows("faces", 3).astype(np.int64),
         rows("vertex_normals", 3) if is_smooth else None,
-        rows("vertex_texcoords", 2) if shape.has_vertex_texcoords() else None,
+        uv=rows("vertex_texcoords", 2) if shape.has_vertex_texcoords() else None,
     )

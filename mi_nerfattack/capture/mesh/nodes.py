@@ -54,7 +54,7 @@ def place_meshes(path: Path, tree: Any, accessors: Accessors) -> None:
         if "skin" in node:  # then the node's own place does not count
             skin = tree["skins"][node["skin"]]
             number = _add_skinned(
-                tree, mesh, _joints(skin, world, accessors), accessors
+                tree, mesh, _joints(skin, world, accessors), accessors=accessors
             )
             matrix = np.eye(4)
         placed += [

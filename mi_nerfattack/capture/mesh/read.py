@@ -276,8 +276,8 @@ def _read_part(geometry: Any, base_colours: tuple[BaseColour, ...]) -> MeshPart:
             part.vertices[flat],
             np.arange(len(flat)).reshape(-1, 3),
             (1.0, 1.0, 1.0),
-            None if part.normals is None else part.normals[flat],
-            np.repeat(colours, 3, axis=0),
+            normals=None if part.normals is None else part.normals[flat],
+            vertex_colour=np.repeat(colours, 3, axis=0),
         )
     return part
 

@@ -82,7 +82,7 @@ def field_surface(field: GridField) -> ColouredMesh:
     vertices = field.lower + voxel * (grid_vertices.astype(np.float64) - 1)
     faces = _turned_outward(vertices, faces, normals)
     colours = seen_colours(field, vertices, normals)
-    return ColouredMesh(vertices, faces, normals, colours)
+    return ColouredMesh(vertices, faces, normals, colours=colours)
 
 
 def painted_mesh(field: GridField, mesh: TexturedMesh) -> ColouredMesh:
@@ -117,7 +117,7 @@ def painted_mesh(field: GridField, mesh: TexturedMesh) -> ColouredMesh:
         np.add.at(count, faces[:, corner], 1.0)
     inner = 0.9 * vertices + 0.1 * middle / count[:, None]
     colours = seen_colours(field, inner, side * normals)
-    return ColouredMesh(vertices, faces, normals, colours)
+    return ColouredMesh(vertices, faces, normals, colours=colours)
 
 
 def check_same_box(field: GridField, mesh: TexturedMesh) -> None:
@@ -213,7 +213,7 @@ def seen_colours(
         eye = points[part] + _OUTSIDE * voxel * normals[part]
         origin, direction = _point(eye), mi.Vector3f(_point(-normals[part]))
         with dr.suspend_grad():
-            integrals = march(posed, Rays(origin, direction, far, half))
+            integrals = march(posed, Rays(origin, direction, far, jitter=half))
             point = _point(points[part])
             _, own = field.eval(point, direction, mi.Bool(True))
             clear = integrals.opacity > _FAINT

@@ -74,7 +74,7 @@ def align(
         SetupError: markers need OpenCV, which is not installed.
     """
     if isinstance(scale_source, Markers):
-        markers = find_markers(folder, structure, scale_source, progress)
+        markers = find_markers(folder, structure, scale_source, progress=progress)
         metres, spread = markers.scale(scale_source.edge_m)
         scale = Scale(metres, spread, dict(markers.views))
         if scale_source.flat:
@@ -84,7 +84,10 @@ def align(
     if isinstance(scale_source, Tracked):
         fit = fit_tracked(structure, scale_source)
         moved = _transformed(
-            structure, fit.scale, np.array(fit.rotation), np.array(fit.translation)
+            structure,
+            fit.scale,
+            np.array(fit.rotation),
+            shift=np.array(fit.translation),
         )
         return moved, Scale(fit.scale, tracked=fit)
     metres = (
@@ -127,7 +130,7 @@ def upright(structure: Structure, scale: float) -> Structure:
             "photographs: their upward directions cancel, so that z cannot point up; "
             "turn the photographs upright first, or lay markers flat on the ground"
         )
-    return _moved(structure, scale, up, poses[:, :3, 3].mean(0))
+    return _moved(structure, scale, up, origin=poses[:, :3, 3].mean(0))
 
 
 def _on_ground(
@@ -137,7 +140,10 @@ def _on_ground(
     centre = structure.camera_to_world[:, :3, 3].mean(0)
     height = float((centre - point) @ normal)
     return _moved(
-        structure, scale, normal * np.sign(height or 1.0), centre - height * normal
+        structure,
+        scale,
+        normal * np.sign(height or 1.0),
+        origin=centre - height * normal,
     )
 
 
@@ -145,7 +151,7 @@ def _moved(
     structure: Structure, scale: float, up: np.ndarray, origin: np.ndarray
 ) -> Structure:
     turn = Rotation.align_vectors([0.0, 0.0, 1.0], up)[0].as_matrix()  # the smallest
-    return _transformed(structure, scale, turn, -scale * turn @ origin)
+    return _transformed(structure, scale, turn, shift=-scale * turn @ origin)
 
 
 def _transformed(

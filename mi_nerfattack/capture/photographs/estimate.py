@@ -143,10 +143,10 @@ def estimate_poses(
         for each in (staged, masks, work):
             each.mkdir()
         groups = stage(root, names, staged, progress)
-        check_in_place(root, names, staged, Path(output) / "images")
+        check_in_place(root, names, staged, out=Path(output) / "images")
         names = sorted(name for group in groups.values() for name in group)
         if options.masks is not None:
-            stage_masks(options.masks, staged, names, masks)
+            stage_masks(options.masks, staged, names, target=masks)
         structure = reconstruct(
             staged,
             list(groups.values()),
@@ -160,8 +160,10 @@ def estimate_poses(
         )
         scale_source = options.markers or options.tracked
         scale_source = scale_source or options.distance or options.metres_per_unit
-        structure, scale = align(structure, staged, scale_source, progress)
-        return _write(Path(output), staged, masks, structure, names, scale)
+        structure, scale = align(structure, staged, scale_source, progress=progress)
+        return _write(
+            Path(output), staged, masks, structure=structure, names=names, scale=scale
+        )
 
 
 def _write(
@@ -199,7 +201,14 @@ def _write(
     }
     stored = [f"images/{name}" for name in structure.names]
     poses = structure.camera_to_world
-    write_poses(path, stored, structure.cameras, poses, extra, masks=masked)
+    write_poses(
+        path,
+        stored,
+        structure.cameras,
+        camera_to_world=poses,
+        extra=extra,
+        masks=masked,
+    )
     eyes = poses[:, :3, 3]
     apart = np.linalg.norm(eyes[:, None] - eyes[None], axis=2)
     a, b = np.unravel_index(int(apart.argmax()), apart.shape)

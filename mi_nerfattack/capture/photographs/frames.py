@@ -93,7 +93,7 @@ def _spaced(motion: Motion, baseline: float) -> list[int]:
     start = 0
     while True:  # each of them is later, as its place is not the last one's
         near = 1 - _SLACK if indices else 0.0
-        moved = _moved_from(motion, start, baseline, near + 2 * _SLACK)
+        moved = _moved_from(motion, start, baseline, limit=near + 2 * _SLACK)
         is_beyond = moved[-1] > near + 2 * _SLACK
         if indices and not is_beyond:
             return indices

@@ -121,7 +121,11 @@ def fit_tracked(structure: Structure, tracked: Tracked) -> HandEye:
     turned = Rotation.from_matrix(body[:, :3, :3])
     camera_rotations = Rotation.from_matrix(camera[:, :3, :3])
     start = _start(
-        tracked.where, turned, camera_rotations, body[:, :3, 3], camera[:, :3, 3]
+        tracked.where,
+        turned,
+        camera_rotations,
+        places=body[:, :3, 3],
+        camera_places=camera[:, :3, 3],
     )
 
     def residuals(x: np.ndarray) -> np.ndarray:

@@ -86,8 +86,8 @@ def open_camera(
     else:
         raise InputError(f"camera {text!r}: no intrinsics; give those of its frames")
     if kind == "video":
-        return VideoCamera(Path(source), prepare, clock, is_looped)
-    return V4lCamera(source, prepare, fps, clock)
+        return VideoCamera(Path(source), prepare, clock, is_looped=is_looped)
+    return V4lCamera(source, prepare, fps, clock=clock)
 
 
 def _only_calibration() -> Path:

@@ -62,7 +62,7 @@ class V4lCamera(AbstractCamera):
         self._lock = threading.Lock()
         self._unprepared: tuple[Any, float, int] | None = None
         self._error, self._is_closed = "", threading.Event()
-        self._container = _opened(device, prepare, fps, driver)
+        self._container = _opened(device, prepare, fps, driver=driver)
         self._heard_s, self._longest_s = time.monotonic(), _FIRST_S
         self._thread = threading.Thread(target=self._read, name="camera", daemon=True)
         self._thread.start()
@@ -103,7 +103,9 @@ class V4lCamera(AbstractCamera):
                     is_kernels = age_s < _KERNEL_S
                 is_kernels = is_kernels and age_s >= 0
                 age_s = age_s if is_kernels else 0.0
-                check_size(self._device, frame.width, frame.height, self._prepare)
+                check_size(
+                    self._device, frame.width, frame.height, prepare=self._prepare
+                )
                 with self._lock:
                     self._unprepared = frame, came_s - age_s, index
                 self._heard_s, self._longest_s = now, _SILENT_S
@@ -148,7 +150,7 @@ def _opened(device: str, prepare: AbstractPreparation, fps: int, driver: str) ->
         ) from error
     try:
         stream = container.streams.video[0]
-        check_size(device, stream.width, stream.height, prepare)
+        check_size(device, stream.width, stream.height, prepare=prepare)
     except (InputError, IndexError) as error:
         container.close()
         if isinstance(error, IndexError):

@@ -45,7 +45,7 @@ class VideoCamera(AbstractCamera):
         self._due = next(self._frames, None)
         if self._due is None:
             raise InputError(f"{path}: no frames; truncated: copy it again")
-        check_size(str(path), self._due[1].width, self._due[1].height, prepare)
+        check_size(str(path), self._due[1].width, self._due[1].height, prepare=prepare)
         self._start_s = clock()
 
     def newest(self) -> Frame | None:
@@ -64,7 +64,9 @@ class VideoCamera(AbstractCamera):
             self._due = next(self._frames, None)
         if shown is not None:
             time_s, frame = shown
-            check_size(str(self._path), frame.width, frame.height, self._prepare)
+            check_size(
+                str(self._path), frame.width, frame.height, prepare=self._prepare
+            )
             image = self._prepare.apply(rgb_of(self._path, frame))
             self._frame = Frame(image, self._start_s + time_s, index)
         elif self._due is None and self._frame is not None:

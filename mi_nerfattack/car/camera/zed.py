@@ -145,7 +145,7 @@ def _lens(
             f"{where}: {', '.join(unknown)}: no coefficient that is read; it has "
             f"{', '.join((*_PINHOLE, *_LENS))}"
         )
-    values = [_number(where, table, key, "0") for key in _LENS]
+    values = [_number(where, table, key, default="0") for key in _LENS]
     for key in ("k1", "k2"):  # which every lens has
         _number(where, table, key)
     return tuple(values if any(values[5:]) else values[:5])

@@ -275,4 +275,4 @@ def read_config(
             "stand in its TOML file: give that as --policy"
         )
     values |= replaced | chosen
-    return read_section(name, DriveConfig, values, Path())
+    return read_section(name, DriveConfig, values, folder=Path())

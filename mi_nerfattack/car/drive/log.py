@@ -186,13 +186,13 @@ class DriveLog:
             "decided_s": decision.time_s,
             "control": decision.control,
         }
-        self._command(time_s, made, request, sent, brake=False)
+        self._command(time_s, made, request, sent=sent, brake=False)
 
     def brake(self, time_s: float) -> None:
         """Write that the car was braked and its wheels centred."""
         still, none = Command(0.0, 0.0), math.nan
         made = {"frame_index": -1, "frame_time_s": none, "decided_s": none}
-        self._command(time_s, {**made, "control": none}, still, still, brake=True)
+        self._command(time_s, {**made, "control": none}, still, sent=still, brake=True)
 
     def _command(
         self,

@@ -94,7 +94,7 @@ class LocalPilot(AbstractPilot):
                     control = self._begin()
                 value = control(frame)
                 now = self._clock()
-                decision = Decision(value, frame.index, frame.time_s, now)
+                decision = Decision(value, frame.index, frame.time_s, time_s=now)
             except BaseException as error:  # a thread has nobody else to tell
                 with self._changed:
                     self._error = error

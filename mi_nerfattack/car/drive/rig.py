@@ -118,18 +118,26 @@ def open_rig(
         camera_device = open_camera(config.camera, camera, zed, clock=clock)
         stack.callback(camera_device.close)
         tracker = open_tracker(
-            config.tracker, mount, config.rotation, config.tracker_sender, clock
+            config.tracker,
+            mount,
+            config.rotation,
+            sender=config.tracker_sender,
+            clock=clock,
         )
         stack.callback(tracker.close)
         if overlaid is not None:
             camera_device = overlaid(camera_device, tracker, mount)
-        enable = JoystickEnable(config.enable, config.button, clock, config.silence_s)
+        enable = JoystickEnable(
+            config.enable, config.button, clock, silence_s=config.silence_s
+        )
         stack.callback(enable.close)
-        pilot = LocalPilot(begin_control(config, route, trained.policy, tracker), clock)
+        pilot = LocalPilot(
+            begin_control(config, route, trained.policy, tracker=tracker), clock
+        )
         stack.callback(pilot.close)
         motor = VescMotor(config.port, scales, confirm)
         stack.callback(motor.close)
-        devices = Devices(camera_device, tracker, motor, pilot, enable)
+        devices = Devices(camera_device, tracker, motor, pilot=pilot, enable=enable)
         yield Rig(devices, clock, time.sleep, suspended_clock, trained.mount)
 
 

@@ -107,7 +107,7 @@ def open_tracker(
     kind, _, source = text.partition(":")
     if kind == "vicon":
         host, port = _host_and_port(text, source)
-        return ViconTracker(host, port, convention, sender, clock)
+        return ViconTracker(host, port, convention, sender=sender, clock=clock)
     if kind == "motioncapture":
         system, _, host = source.partition(":")
         if not system or not (host or system == "mock"):

@@ -61,7 +61,7 @@ class Calibration(Section):
             InputError: a value is not plausible.
         """
         table = self.model_dump() | dict(values)
-        return read_section("calibration", Calibration, table, "")
+        return read_section("calibration", Calibration, table, folder="")
 
     def encode(self, command: Command) -> tuple[int, int]:
         """Return electrical turns a minute and thousandths of the servo's range.
@@ -95,7 +95,9 @@ def read_calibration(path: str | Path) -> Calibration:
         InputError: the file cannot be read, or a value is not plausible.
     """
     path = Path(path)
-    return read_section(str(path), Calibration, files.read_toml(path), path.parent)
+    return read_section(
+        str(path), Calibration, files.read_toml(path), folder=path.parent
+    )
 
 
 def write_calibration(path: str | Path, calibration: Calibration) -> None:

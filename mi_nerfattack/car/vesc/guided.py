@@ -246,7 +246,7 @@ def read_arcs(path: Path) -> dict[Drive, Arc]:
     """
     if not path.exists():
         return {}
-    arcs = read_section(str(path), dict[Drive, Arc], files.read_json(path), "")
+    arcs = read_section(str(path), dict[Drive, Arc], files.read_json(path), folder="")
     for name, arc in arcs.items():
         try:
             arc.check()

@@ -98,7 +98,9 @@ class VescMotor(AbstractMotor):
         """
         self._is_armed, self._has_moved = False, True
         try:
-            set_timeout(self._link, self.firmware, self.calibration, self._confirm)
+            set_timeout(
+                self._link, self.firmware, self.calibration, confirm=self._confirm
+            )
             prove_timeout(self._link, self.calibration, check)
         finally:
             self.brake()

@@ -71,7 +71,7 @@ def set_timeout(
     kind = Id.SET_APPCONF_NO_STORE
     if (firmware.major, firmware.minor) < _WITHOUT_FLASH:
         kind = Id.SET_APPCONF
-        _ask_for_flash(firmware, before, calibration, confirm)
+        _ask_for_flash(firmware, before, calibration, confirm=confirm)
     link.ask(bytes([kind]) + patched[1:], _FLASH_S)
     after = _configuration(link, firmware)
     if after[: _HEAD.size] + after[end:] != before[: _HEAD.size] + before[end:]:
@@ -115,14 +115,14 @@ def prove_timeout(
     limit_s, is_braked = calibration.timeout_ms / 1000 + _MARGIN_S, True
     for _ in range(_TRIES):
         silent, turning = _turn_wheels(link, calibration, check)
-        late, readings = _fall_silent(link, silent, limit_s, check)
+        late, readings = _fall_silent(link, silent, limit_s, check=check)
         if not readings[-1].has_timed_out:
             raise InputError(
                 f"VESC: {1000 * limit_s:.0f} ms after the last command it does not "
                 f"brake, though its timeout reads {calibration.timeout_ms} ms; do not "
                 "drive with it"
             )
-        readings += _see_it_brake(link, turning, readings[-1], check)
+        readings += _see_it_brake(link, turning, readings[-1], check=check)
         is_braked = _is_braked(readings, calibration.brake_current_a)
         if is_braked and late < limit_s + _LATE_S:
             return

@@ -87,7 +87,7 @@ def finish(
 
     result.save(output, provenance)
     title = f"Fit of {output.name}"
-    page = write_fit_report(report_folder(output), result, images, title)
+    page = write_fit_report(report_folder(output), result, images, title=title)
     checkpoint.unlink(missing_ok=True)  # before a closed pipe can end this
 
     size = result.field.upper - result.field.lower

@@ -82,7 +82,9 @@ class PolicyFile:
         ):
             if key in values:
                 value = values.pop(key)
-                sections[key] = read_section(f"{name}: {key}", kind, value, folder)
+                sections[key] = read_section(
+                    f"{name}: {key}", kind, value, folder=folder
+                )
         if sections and values and "scene" not in values:
             raise InputError(
                 f"{name}: {', '.join(values)}: has no effect without [scene]; allowed: "
@@ -222,7 +224,7 @@ def read_camera(name: str) -> Rig:
     if not {"camera", "scene"} & set(values):
         raise InputError(f"{name}: has no section [camera]")
     where, camera = f"{name}: camera", values.get("camera", {})
-    return read_section(where, CameraSection, camera, folder).rig()
+    return read_section(where, CameraSection, camera, folder=folder).rig()
 
 
 def _read_values(

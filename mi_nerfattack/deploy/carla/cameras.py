@@ -58,8 +58,8 @@ class CarlaCameras:
         }
         pose = camera_to_carla(body_to_camera)
         colour = {**shape, **COLOUR_ATTRIBUTES, **attributes}
-        self._colour = _Inbox(session.spawn(COLOUR, pose, colour, parent))
-        self._depth = _Inbox(session.spawn(DEPTH, pose, shape, parent))
+        self._colour = _Inbox(session.spawn(COLOUR, pose, colour, parent=parent))
+        self._depth = _Inbox(session.spawn(DEPTH, pose, shape, parent=parent))
 
     def read(self, frame: int) -> CameraFrame:
         """Wait for both images of a frame.
@@ -115,4 +115,4 @@ class _Inbox:
 def read_pose(transform: Any) -> CarlaPose:
     """Copy a `carla.Transform`."""
     at, turn = transform.location, transform.rotation
-    return CarlaPose(at.x, at.y, at.z, turn.pitch, turn.yaw, turn.roll)
+    return CarlaPose(at.x, at.y, at.z, pitch=turn.pitch, yaw=turn.yaw, roll=turn.roll)

@@ -106,7 +106,12 @@ def body_to_carla(body_to_world: ArrayLike) -> CarlaPose:
         yaw, roll = math.atan2(-rotation[0, 1], rotation[1, 1]), 0.0
     x, y, z = point_to_carla(matrix[:3, 3]).tolist()
     return CarlaPose(
-        x, y, z, math.degrees(pitch), -math.degrees(yaw), math.degrees(roll)
+        x,
+        y,
+        z,
+        pitch=math.degrees(pitch),
+        yaw=-math.degrees(yaw),
+        roll=math.degrees(roll),
     )
 
 

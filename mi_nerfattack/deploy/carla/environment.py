@@ -104,7 +104,11 @@ class CarlaEnvironment(AbstractEnvironment):
             axles, height = self._spawn(start)
             body_to_camera = axles.body_to_world(np.eye(4)) @ self._mount
             self._cameras = CarlaCameras(
-                self.session, self.camera, self._actor, body_to_camera, self._attributes
+                self.session,
+                self.camera,
+                self._actor,
+                body_to_camera=body_to_camera,
+                attributes=self._attributes,
             )
             frame, speed = 0, route.speed_ms
             self.driver.begin(

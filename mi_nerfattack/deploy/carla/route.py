@@ -135,11 +135,17 @@ def _along_lanes(
         if not trail:
             trail.append(waypoint)
         elif not _arrived(trail[-1], waypoint, _SPACING_M):
-            trail += _shortest(place, trail[-1], waypoint, _SPACING_M)[1:]
+            trail += _shortest(place, trail[-1], waypoint, spacing_m=_SPACING_M)[1:]
     points = np.array([_position(waypoint)[:2] for waypoint in trail])
     moved = np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-3
     points = points[np.concatenate([[True], moved])]
-    return Route(route.name, goal, points, float(trail[0].lane_width), speed_ms)
+    return Route(
+        route.name,
+        goal,
+        points,
+        lane_width_m=float(trail[0].lane_width),
+        speed_ms=speed_ms,
+    )
 
 
 def _shortest(place: str, first: Any, last: Any, spacing_m: float) -> list[Any]:

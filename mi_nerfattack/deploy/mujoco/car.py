@@ -92,7 +92,7 @@ def add_car(spec: mujoco.MjSpec, car: Car, handling: Handling) -> None:
     column.explicitinertial, column.ipos = True, [0, 0, 0]
     column.add_joint(name=COLUMN, axis=[0, 0, 1])
     for name in WHEELS:
-        _add_wheel(body, name, car, handling)
+        _add_wheel(body, name, car, handling=handling)
     _add_linkage(spec, car)
     _add_actuators(spec, car, handling)
 

@@ -191,7 +191,7 @@ def _indoor_irradiance(scene: Any) -> tuple[np.ndarray, np.ndarray]:
         ray = mi.RayDifferential3f(mi.Ray3f(origin, direction))
         radiance, *_ = scene.integrator().sample(scene, sampler, ray)
         irradiance = math.pi * rgb_rows(radiance).mean(axis=0).astype(np.float64)
-        result.append(irradiance + _from_points(scene, sampler, origin, normal))
+        result.append(irradiance + _from_points(scene, sampler, origin, normal=normal))
     return result[0], result[1]
 
 

@@ -99,7 +99,9 @@ def add_meshes(
     for index, mesh in enumerate(map(_padded, meshes)):
         name = f"{index:03d}_{mesh.name}"
         factor = gain if mesh.shines else white
-        _add_material(spec, name, mesh, _encode(mesh.texture * np.float32(factor)))
+        _add_material(
+            spec, name, mesh, texels=_encode(mesh.texture * np.float32(factor))
+        )
         _add_mesh(spec, name, mesh)
         spec.worldbody.add_geom(
             name=name,

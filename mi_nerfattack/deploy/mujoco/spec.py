@@ -47,7 +47,7 @@ def map_spec(
     lighting = read_lighting(scene).scaled(gain)
     spec = mujoco.MjSpec()
     mjcf_car.add_ground(spec)
-    add_meshes(spec, meshes, lighting.white, gain)
+    add_meshes(spec, meshes, lighting.white, gain=gain)
     add_lighting(spec, lighting)
     _set_visual(spec, np.concatenate([mesh.vertices for mesh in meshes]))
     return spec

@@ -168,12 +168,12 @@ def open_recording(
     with files.reported(source):
         is_folder = source.is_dir()
     if is_folder:
-        return FolderRecording(source, camera, mount, period)
+        return FolderRecording(source, camera, mount, period=period)
     suffix = source.suffix.lower()
     if suffix in VIDEO_SUFFIXES:
         return VideoRecording(source, camera, mount)
     if suffix == ".mcap":
-        return McapRecording(source, camera, mount, topics)
+        return McapRecording(source, camera, mount, topics=topics)
     raise InputError(
         f"{source}: not a recording; give a folder, a video "
         f"({', '.join(VIDEO_SUFFIXES)}) or a log (.mcap)"

@@ -88,7 +88,7 @@ class McapTopics:
 
 
 _NAMES = McapTopics(
-    "/camera/image", "/camera/pose", "/vehicle/pose", "/camera/camera_info"
+    "/camera/image", "/camera/pose", "/vehicle/pose", calibration="/camera/camera_info"
 )
 
 
@@ -111,7 +111,7 @@ class McapRecording(AbstractRecording):
     ) -> None:
         topics = topics or McapTopics()
         log_topics, self.remarks = read_topics(path)
-        images = _choose(path, log_topics, topics, "image", _IMAGES)
+        images = _choose(path, log_topics, topics, role="image", kinds=_IMAGES)
         if images is None:
             cut = "".join(f" ({remark})" for remark in self.remarks)
             raise InputError(
@@ -120,7 +120,7 @@ class McapRecording(AbstractRecording):
             )
         self._path, self._images = path, images.decode()
         times = _stamps(images.where, self._images)
-        where, pose_times, poses = _camera_poses(path, log_topics, topics, mount)
+        where, pose_times, poses = _camera_poses(path, log_topics, topics, mount=mount)
         frames = _with_poses(times, pose_times, poses)
         if len(times[frames]) != len(times):
             self.remarks += (
@@ -128,9 +128,13 @@ class McapRecording(AbstractRecording):
                 f"before and after them there are no poses on {where}",
             )
         times, self._images = times[frames], self._images[frames]
-        frame_poses = poses_of_frames(str(path), where, times, pose_times, poses)
+        frame_poses = poses_of_frames(
+            str(path), where, times, pose_times=pose_times, matrices=poses
+        )
         self.track = Track(str(path), times, frame_poses)
-        own = _calibration(_choose(path, log_topics, topics, "calibration", _INFOS))
+        own = _calibration(
+            _choose(path, log_topics, topics, role="calibration", kinds=_INFOS)
+        )
         self.camera = required_camera(path, own, camera)
 
     def image(self, index: int) -> np.ndarray:
@@ -166,7 +170,9 @@ def read_vehicle_poses(
         InputError: it cannot be read, or has no poses.
     """
     log_topics, _ = read_topics(path)
-    _, times, poses = _camera_poses(path, log_topics, topics or McapTopics(), mount)
+    _, times, poses = _camera_poses(
+        path, log_topics, topics or McapTopics(), mount=mount
+    )
     return times, poses @ np.linalg.inv(camera_to_body(mount))
 
 
@@ -210,10 +216,10 @@ def _camera_poses(
     of_camera, chosen = np.eye(4), None
     if topics.camera_pose is not None or _NAMES.camera_pose in log_topics:
         if topics.vehicle_pose is None:
-            chosen = _choose(path, log_topics, topics, "camera_pose", _POSES)
+            chosen = _choose(path, log_topics, topics, role="camera_pose", kinds=_POSES)
     if chosen is None:
         of_camera = camera_to_body(mount)
-        chosen = _choose(path, log_topics, topics, "vehicle_pose", _POSES)
+        chosen = _choose(path, log_topics, topics, role="vehicle_pose", kinds=_POSES)
     if chosen is None:
         raise InputError(
             f"{path}: no {', '.join(_POSES)}; record the poses, too"

@@ -166,7 +166,9 @@ def read_topics(path: Path) -> tuple[dict[str, Topic], tuple[str, ...]]:
                 others.add(f"{topic} has {schema!r} in {encoding!r}")
                 continue
             where = f"{path}: {topic}"
-            topics.setdefault(topic, Topic(where, topic, schema, [])).raw.append(data)
+            topics.setdefault(topic, Topic(where, topic, schema, raw=[])).raw.append(
+                data
+            )
     except InputError:
         raise
     except (McapError, struct.error, ValueError, KeyError, OverflowError) as error:

@@ -132,4 +132,6 @@ def _assign(path: Path, table: PoseTable, times: np.ndarray) -> np.ndarray:
                 "frames; give one for each, or times"
             )
         return poses
-    return poses_of_frames(str(path), str(table.where), times, table.times, poses)
+    return poses_of_frames(
+        str(path), str(table.where), times, pose_times=table.times, matrices=poses
+    )

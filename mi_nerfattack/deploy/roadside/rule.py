@@ -140,7 +140,7 @@ class Roadside:
                     shape, scales, surroundings, route=route, stretch=stretch, rng=rng
                 )
                 stands = self._free(stands, surroundings, [item for item, _ in placed])
-                chosen = self._first_visible(stands, surroundings, eyes, placed)
+                chosen = self._first_visible(stands, surroundings, eyes, placed=placed)
                 if chosen is not None:
                     placed.append(chosen)
                     pose = chosen[0].pose(0)
@@ -194,7 +194,11 @@ class Roadside:
         ground = surroundings.height(centre)
         lane = surroundings.height(route.pose_at(arc)[:, :2])
         stands = Stands(
-            shape, centre, ground, route.heading_at(arc) + turn[known], scale[known]
+            shape,
+            centre,
+            ground,
+            yaw=route.heading_at(arc) + turn[known],
+            scale=scale[known],
         )
         return stands[np.abs(ground - lane) < KERB_M[1]]
 

@@ -82,4 +82,6 @@ def look(
     for row in range(len(stands)):
         mine = open_ & (box == row)
         where = image[box[mine], which[mine], frame[mine]]
-        yield VisiblePoints(len(poses), frame[mine], where, eye[mine], point[mine])
+        yield VisiblePoints(
+            len(poses), frame[mine], where, eye=eye[mine], point=point[mine]
+        )

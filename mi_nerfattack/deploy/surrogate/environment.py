@@ -151,8 +151,8 @@ class SurrogateEnvironment(AbstractSimulation):
             np.round(255 * np.array(observation.image)[0]).astype(np.uint8),
             depth.numpy().reshape(shape),
             mount_matrix(self.state[None, :3], sensor.mount)[0],
-            observation.linear.numpy().T.reshape(*shape, 3),
-            partial(_split, sensor, observation, distances, shape)
+            linear=observation.linear.numpy().T.reshape(*shape, 3),
+            split=partial(_split, sensor, observation, distances, shape)
             if can_split
             else None,
         )

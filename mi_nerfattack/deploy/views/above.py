@@ -48,7 +48,9 @@ class PixelRays:
     def _record(self, origin: mi.Point3f, columns: Any) -> Rays:
         origins, directions = generate_rays(self.camera, origin, columns, n_poses=1)
         far, middle = dr.opaque(mi.Float, dr.inf), dr.opaque(mi.Float, 0.5)
-        return Rays(origins, directions, far, middle, dr.opaque(mi.Bool, True))
+        return Rays(
+            origins, directions, far, jitter=middle, active=dr.opaque(mi.Bool, True)
+        )
 
     def _state(self, origin: mi.Point3f, columns: Any) -> list[Any]:
         del origin, columns
@@ -117,7 +119,7 @@ def scene_above(
     ray = mi.Ray3f(rays.origin + start * rays.direction, rays.direction)
     t = start + scene.ray_intersect_preliminary(ray, coherent=True).t
     depth = dr.select(dr.isfinite(t), t, dr.inf).numpy().reshape(linear.shape[:2])
-    return CameraFrame(linear_to_uint8(linear), depth, pose, linear)
+    return CameraFrame(linear_to_uint8(linear), depth, pose, linear=linear)
 
 
 def _lid(scene: Any, points: np.ndarray, from_m: float = 2.0) -> float:

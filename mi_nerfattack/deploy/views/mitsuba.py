@@ -51,7 +51,7 @@ class MitsubaView(AbstractView):
         rgb, depth = self.linear(camera_to_world, seed)
         image = linear_to_uint8(rgb)
         pose = np.array(camera_to_world, np.float64)
-        return self._paster.paste(CameraFrame(image, depth, pose, rgb))
+        return self._paster.paste(CameraFrame(image, depth, pose, linear=rgb))
 
     def linear(
         self, camera_to_world: np.ndarray, seed: int

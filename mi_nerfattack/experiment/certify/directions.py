@@ -75,7 +75,9 @@ class Ended:
         path, identity = folder / CHECKPOINT, scenario.identity()
         check_unchanged(path, identity)
         format_alone = {"format": CHECKPOINT_FORMAT}
-        checkpoint = Unit(path, format_alone, CheckpointRecord, "").read(force=True)
+        checkpoint = Unit(path, format_alone, CheckpointRecord, remedy="").read(
+            force=True
+        )
         if checkpoint is None:
             raise InputError(f"{path}: is missing; make the attack again")
         world = build_world(scenario, scenario.build_policy())

@@ -132,7 +132,7 @@ class Differences(AbstractWork):
     def _unit(self, name: str) -> Unit[Measured]:
         identity = {"format": FORMAT, **self.identity, "piece": name}
         path = self.folder / f"{name}-{short_digest(identity)}.safetensors"
-        return Unit(path, identity, Measured, "remove the file")
+        return Unit(path, identity, Measured, remedy="remove the file")
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the attack behind, whose world no process can send."""

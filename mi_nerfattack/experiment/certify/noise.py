@@ -240,7 +240,7 @@ class Searches(AbstractWork):
 
     def _specs(self, point: np.ndarray) -> list[DriveSpec]:
         pairs = enumerate(self.draws)
-        return [self.smoothing.spec(point, draw, ATTACK, k) for k, draw in pairs]
+        return [self.smoothing.spec(point, draw, ATTACK, run=k) for k, draw in pairs]
 
     def _judged(self, point: np.ndarray) -> float:
         values = []

@@ -117,7 +117,9 @@ class _Job:
         smoothing, zero = self.smoothing, np.zeros(self.smoothing.count)
         numbers = range(self.settings.runs)
         draws = [smoothing.draw(self.world, CENTRE, k) for k in numbers]
-        specs = [smoothing.spec(zero, draw, RANDOM, k) for k, draw in enumerate(draws)]
+        specs = [
+            smoothing.spec(zero, draw, RANDOM, run=k) for k, draw in enumerate(draws)
+        ]
         finished = self.drive("driving under noise", specs)
         severities = [self.severity(item) for item in finished]
         noise = np.array([draw.noise for draw in draws])
@@ -137,7 +139,7 @@ class _Job:
         draws = [smoothing.draw(self.world, SEARCH, k) for k in numbers]
         seed, count = self.world.scenario.seed, settings.proposals
         searches = [
-            BallSearch(radius, direction, count, seed) for radius in settings.radii
+            BallSearch(radius, direction, count, seed=seed) for radius in settings.radii
         ]
         limit = self.lane.wheel_m
         work = Searches(self.work(), smoothing, draws, searches, limit)
@@ -158,7 +160,7 @@ class _Job:
         draws = [smoothing.draw(world, ATTACKED, k) for k in range(noisy)]
         draws += [smoothing.nominal(world, k) for k in range(plain)]
         specs = [
-            smoothing.spec(point, draw, ATTACK, k)
+            smoothing.spec(point, draw, ATTACK, run=k)
             for point in points
             for k, draw in enumerate(draws)
         ]
@@ -224,7 +226,7 @@ def certify_robustness(
         world = build_world(scenario, scenario.build_policy())
         looks = Looks(world, settings.coefficients)
         label = settings.environment
-        smoothing = Smoothing.of(world, label, looks, settings.sd)
+        smoothing = Smoothing.of(world, label, looks, sd=settings.sd)
         world.open(label).close()  # what cannot be made is reported before hours
         store = Store(output / DRIVES)
         job = _Job(
@@ -240,8 +242,8 @@ def certify_robustness(
             centre, direction = job.centre()
             points = job.search(direction)
             attacked = job.attacked(points)
-        document = _document(job, evaluated, centre, points, attacked)
-        _write(output, document, job, centre, attacked)
+        document = _document(job, evaluated, centre, points=points, attacked=attacked)
+        _write(output, document, job, centre=centre, attacked=attacked)
     return document
 
 
@@ -272,7 +274,8 @@ def _document(
         "chance_bound": bound,
         "drive_s": float(np.median([item.wall_s for item in centre])),
         "rows": [
-            job.row(radius, bound, point, finished) for radius, point, finished in radii
+            job.row(radius, bound, point, finished=finished)
+            for radius, point, finished in radii
         ],
     }
 

@@ -270,7 +270,7 @@ def view_findings(world: World, first: Drive) -> Iterator[str]:
             visible, most = 0, 0.0
             for step in steps:
                 own = world.fields[k : k + 1]
-                share = changeable_share(world, own, first.poses[step], int(step))
+                share = changeable_share(world, own, first.poses[step], step=int(step))
                 visible, most = visible + (share >= PIXELS), max(most, share)
                 if visible == needed:
                     break
@@ -324,11 +324,13 @@ def place_findings(world: World) -> Iterator[str]:
     objects = dict(zip(names, world.surrogate.objects, strict=True))
     solids = solids_of(objects)
     freedom = scenario.attack.freedom.build()
-    yield from lane_findings(solids, world.route, scenario.vehicle.width_m, freedom)
+    yield from lane_findings(
+        solids, world.route, scenario.vehicle.width_m, freedom=freedom
+    )
     yield from meeting_findings(solids)
     if (scene := mesh_scene(world)) is not None:
         name = scenario.scene.deployment.file.name
-        yield from scene_findings(solids, world.route, scene, name)
+        yield from scene_findings(solids, world.route, scene, name=name)
 
 
 def mesh_scene(world: World) -> Any:

@@ -247,7 +247,7 @@ class Check:
             objects = world.surrogate.objects
             near = world.route.pose_at(np.array(overlay.driven))[:, :2]
             name = f"{world.scenario.scene.deployment.file.name}, from above"
-            bare = scene_above(scene, overhead, near, _SPP)
+            bare = scene_above(scene, overhead, near, spp=_SPP)
             grounds[name] = Paster(overhead.camera, objects).paste(bare).image
             camera = from_fov(*_CHASE_PX, _CHASE_FOV_DEG)
             mount = chase_mount(overlay.car_width_m)

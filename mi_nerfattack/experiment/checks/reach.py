@@ -208,11 +208,11 @@ def measure_reach(
     start = optimised_states(world.scenario, route)[:1]
     try:
         initial = loop.initial(np.repeat(start, len(DRIVES), 0))
-        drive = simulate(loop, initial, world.horizon, on_step)
+        drive = simulate(loop, initial, world.horizon, on_step=on_step)
     finally:
         world.show(original)
     states = drive.states_numpy()[:, 1:]
     error = route.cross_track_numpy(states.reshape(-1, states.shape[2]))
     control = drive.controls_numpy()[0].reshape(world.horizon, -1)[:, 0]
     pixels, limits = np.array(sensor.pixels), np.stack(sensor.limits, 1)
-    return Reach(pixels, control, limits, error.reshape(len(DRIVES), -1))
+    return Reach(pixels, control, limits, cross_track_m=error.reshape(len(DRIVES), -1))

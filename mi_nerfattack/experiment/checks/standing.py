@@ -125,7 +125,9 @@ def lane_findings(
             continue
         if freedom.pose_rate is None:
             continue
-        reached = _reached(solid.points[(z > low) & (z < high)], solid, route, freedom)
+        reached = _reached(
+            solid.points[(z > low) & (z < high)], solid, route, freedom=freedom
+        )
         if reached[1] < half:
             yield (
                 f"{solid.name} may move onto the lane: attack.pose_limit_m and "
@@ -212,7 +214,7 @@ def scene_findings(
         inside = _is_inside(scene, points, route)
         depth = np.where(inside, distance.min(1), 0.0)
         if inside.mean() > SHARE and depth.max() > DEPTH_M:
-            yield _buried(solid.name, name, points, distance, depth)
+            yield _buried(solid.name, name, points, distance=distance, depth=depth)
         elif not inside.any() and distance.min() > GAP_M:
             lowest = points[:, 2] < points[:, 2].min() + GAP_M / 4
             gap = distance[lowest, -1].min()

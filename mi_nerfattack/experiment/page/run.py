@@ -186,7 +186,9 @@ def _drive_scrubbers(folder: Path, document: Mapping[str, Any]) -> list[Scrubber
     names += document.get("replay") or {}
     errors = _read_errors(folder / "steps.csv")
     period = document["scenario"]["vehicle"]["dt_s"]
-    scrubbers = [_drive_scrubber(folder, name, errors, period) for name in names]
+    scrubbers = [
+        _drive_scrubber(folder, name, errors, period_s=period) for name in names
+    ]
     return [scrubber for scrubber in scrubbers if scrubber is not None]
 
 
@@ -199,7 +201,7 @@ def _turntables(folder: Path, document: Mapping[str, Any]) -> list[Scrubber]:
         if path.is_file():
             alt = f"{item['id']} as the attack left it, turned about the vertical"
             views = turntable(load_grid(path), VIEWS, VIEW_PX)
-            panes.append(make_pane(item["id"], alt, views, turns))
+            panes.append(make_pane(item["id"], alt, views, labels=turns))
     title = "Objects as the attack left them"
     if not panes:
         return []
@@ -222,12 +224,18 @@ def _drive_scrubber(
         chosen = np.linspace(0, len(steps) - 1, MOST_FRAMES).round().astype(int)
         steps = [steps[index] for index in chosen]
     panes = [
-        _pane(environment, case, own, steps, errors.get((environment, case), {}))
+        _pane(
+            environment,
+            case,
+            own,
+            steps=steps,
+            errors=errors.get((environment, case), {}),
+        )
         for case, own in frames.items()
     ]
     last = (steps[-1] - steps[0]) / max(1, len(steps) - 1)
     title, start = f"First drives in {environment}", _acting(folder, frames, steps)
-    return Scrubber(title, tuple(panes), start, max(last * period_s, 0.05))
+    return Scrubber(title, tuple(panes), start, period_s=max(last * period_s, 0.05))
 
 
 def _acting(
@@ -282,7 +290,7 @@ def _pane(
         word,
         f"what the policy sees in {environment}, {word}, frame by frame",
         [files.read_image(frames[step]) for step in shown],
-        [
+        labels=[
             "{:.1f} s, {:+.2f} m".format(*errors[step])
             if step in errors
             else f"after {step} periods"
@@ -336,4 +344,4 @@ def draw_above(path: Path, folders: Sequence[Path]) -> None:
     if not drives:
         raise InputError(f"{folders[0] / DRIVES}: no drives; they were removed")
     limit = Lane.of(route, scenario.vehicle.width_m).wheel_m
-    overhead(path, drives, route, footprints, limit)
+    overhead(path, drives, route, object_footprints=footprints, limit=limit)

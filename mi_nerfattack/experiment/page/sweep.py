@@ -60,7 +60,11 @@ def read_sweep(
             cells, [row for row in attacks if row["cell"] in sections], on_run
         ),
         pictures=_pictures(
-            cells, table, sections, Path(tempfile.mkdtemp(dir=scratch)), notes
+            cells,
+            table,
+            sections,
+            scratch=Path(tempfile.mkdtemp(dir=scratch)),
+            notes=notes,
         ),
         notes=notes,
     )

@@ -58,7 +58,7 @@ def read_folders(
     runs, sweeps, transfers, retrainings = [], [], [], []
     for path, label in zip(paths, folder_labels(paths), strict=True):
         if (path / RESULTS).is_file():
-            sweeps.append(read_sweep(path, label, scratch, on_run))
+            sweeps.append(read_sweep(path, label, scratch, on_run=on_run))
         elif (path / DOCUMENT).is_file():
             transfers.append(_transfer(path, label))
         elif path.is_file():
@@ -73,7 +73,7 @@ def read_folders(
             )
         else:
             raise InputError(f"{path}: holds no results; {_KINDS}")
-    return PageContents(runs, sweeps, transfers, retrainings)
+    return PageContents(runs, sweeps, transfers, retrainings=retrainings)
 
 
 def _transfer(folder: Path, label: str) -> TransferPart:

@@ -87,9 +87,11 @@ class FrameFolder:
         size = frame.depth.shape
         fitting = {key: a for key, a in layers.items() if a.shape[:2] == size}
         others = {key: a for key, a in layers.items() if key not in fitting}
-        exr.write_layers(self.path / f"{name}.exr", fitting, metadata, half)
+        exr.write_layers(self.path / f"{name}.exr", fitting, metadata, half=half)
         if others:
-            exr.write_layers(self.path / f"{name}_input.exr", others, metadata, half)
+            exr.write_layers(
+                self.path / f"{name}_input.exr", others, metadata, half=half
+            )
         self._names.append(f"{name}.png")
         self._times.append(time_s)
         self._poses.append(frame.camera_to_world)
@@ -181,7 +183,9 @@ def write_frames(
         environment = world.open(drive.environment, empty=look is None)
         try:
             drive_digests = {**digests, **_digests(world, look)}
-            film = Film(world, drive, environment, look is None, drive_digests)
+            film = Film(
+                world, drive, environment, empty=look is None, digests=drive_digests
+            )
             folder = FrameFolder(frame_folder(output, drive), environment.rig)
             costs = film.cost_by_image(written)
             for moment in film.moments({*columns, *written}):
@@ -258,9 +262,9 @@ class Film:
                 else:
                     self.environment.advance(control)
             shown = frame if step in steps else None
-            yield Moment(step, self.environment.state, memory, shown)
+            yield Moment(step, self.environment.state, memory, frame=shown)
             if watched:
-                numbers = policy_numbers(policy, self.environment, route, step)
+                numbers = policy_numbers(policy, self.environment, route, step=step)
                 image = policy_image(frame.image)
                 _, memory = policy.step(image, route.goal, memory, numbers)
 
@@ -329,10 +333,10 @@ class Film:
             describe_lens(rig.cameras[0]),
             moment.rendered_frame.camera_to_world,
             drive.seed,
-            world.surrogate.camera.spp
+            spp=world.surrogate.camera.spp
             if label == SURROGATE
             else world.deployments[label].spp,
-            self.digests,
+            digests=self.digests,
             cameras=None if rig.others is None else rig.described(),
             scenario=world.scenario.name,
             environment=label,

@@ -64,9 +64,9 @@ def write_images(
         names = [item.id for item in world.scenario.objects]
         sweeps = 3 * world.horizon
         on_step = step_counter(on_progress, "surrogate: attribution", sweeps)
-        attribution = attribute(done.attack, names, limit, on_step)
+        attribution = attribute(done.attack, names, limit, on_step=on_step)
         write_attribution(output, attribution, world.fields)
-    write_frames(output, done, frames, on_progress)
+    write_frames(output, done, frames, on_progress=on_progress)
     if frames == "all":
         _write_videos(output, done, on_progress)
 
@@ -74,7 +74,13 @@ def write_images(
 def _write_plots(output: Path, done: Finished, history: list[dict[str, Any]]) -> None:
     world, drives, limit = done.world, done.driven, done.lane.wheel_m
     footprints = object_footprints(world.surrogate.objects)
-    overhead(output / "overhead.png", drives, world.route, footprints, limit)
+    overhead(
+        output / "overhead.png",
+        drives,
+        world.route,
+        object_footprints=footprints,
+        limit=limit,
+    )
     errors(output / "errors.png", by_name(drives), {world.route.name: limit})
     convergence(output / "convergence.png", history, done.curve)
 
@@ -112,10 +118,10 @@ def _write_triptych(output: Path, done: Finished) -> None:
             ground = Paster(above.camera, objects).paste(bare).image
         name = "original" if case == OWN else case
         title = f"({chr(97 + len(panels))}) {name}, {label}"
-        panels.append(Panel(title, drives, object_footprints(objects), ground))
+        panels.append(Panel(title, drives, object_footprints(objects), ground=ground))
     world.show(done.look(ATTACK))
     limit, extent = done.lane.wheel_m, above.extent
-    write_maps(output / "triptych.png", panels, route, limit, extent)
+    write_maps(output / "triptych.png", panels, route, limit=limit, extent=extent)
 
 
 def _write_videos(output: Path, done: Finished, on_progress: OnProgress) -> None:
@@ -125,7 +131,7 @@ def _write_videos(output: Path, done: Finished, on_progress: OnProgress) -> None
     groups = groupby(nominal, lambda drive: drive.environment)
     for label, group in groups:
         drives = list(group)
-        pictures = _pictures(output, drives, f"{label}: video", on_progress)
+        pictures = _pictures(output, drives, f"{label}: video", on_progress=on_progress)
         path = output / "videos" / f"{label}.mp4"
         write_video(path, pictures, 1 / float(drives[0].time_s[0]))
 

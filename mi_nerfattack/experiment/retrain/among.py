@@ -253,7 +253,7 @@ class SectionDrives(AbstractSource):
 
         def control(image: np.ndarray) -> Controls:
             nonlocal memory, step
-            numbers = policy_numbers(prepared, environment, route, step)
+            numbers = policy_numbers(prepared, environment, route, step=step)
             observation, step = policy_image(image), step + 1
             row, memory = prepared.step(observation, route.goal, memory, numbers)
             return single_control(row, environment.control_names)

@@ -81,7 +81,7 @@ class Comparison:
             check_output(output)
             work = self.work(group, stage, policy)
             show = progress(f"{stage}, {group}")
-            documents[group] = run_transfer(work, output, workers, show)
+            documents[group] = run_transfer(work, output, workers, progress=show)
         return documents
 
     def _output(self, group: str, stage: str) -> Path:

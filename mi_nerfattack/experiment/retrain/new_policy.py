@@ -101,7 +101,7 @@ def read_keys(path: Path) -> dict[str, Any]:
         there = ", ".join(document) or "nothing"
         raise InputError(f"{path}: has {there}; a section [policy] alone is needed")
     keys = document["policy"]
-    section = read_section(f"{path}: policy", PolicySection, keys, path.parent)
+    section = read_section(f"{path}: policy", PolicySection, keys, folder=path.parent)
     named = {name: getattr(section, name) for name in type(section).model_fields}
     named = {k: v.portable for k, v in named.items() if isinstance(v, NamedFile)}
     return {**keys, **named}

@@ -67,8 +67,8 @@ def drive_expert(attack: FoundAttack) -> Driven:
         car.control_unit,
         route,
         place.period,
-        car.max_control,
-        car.wheelbase,
+        max_control=car.max_control,
+        wheelbase=car.wheelbase,
         acceleration=acceleration_of(car.more_controls),
     )
     objects = [item for item in attacked_objects(attack) if _is_in_the_way(item)]

@@ -284,7 +284,7 @@ def train_once(
         "frames_sha256": json_digest([files.sha256(path) for path in shards]),
     }
     with exclusive(folder) as lock:
-        if _is_done(folder, order.out.name, identity, check):
+        if _is_done(folder, order.out.name, identity, check=check):
             return identity
         for path in (folder / DONE, order.out):
             with files.reported(path):

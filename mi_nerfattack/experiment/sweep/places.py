@@ -106,4 +106,6 @@ class Places:
 def _surroundings(
     scene: Path, routes: Path, camera: Camera, mount: CameraMount, period: float
 ) -> Surroundings:
-    return Surroundings(load_scene(scene), load_routes(routes), camera, mount, period)
+    return Surroundings(
+        load_scene(scene), load_routes(routes), camera, mount=mount, period=period
+    )

@@ -163,7 +163,7 @@ def summarise(
 
 def _groups(drives: pd.DataFrame) -> list[dict[str, Any]]:
     """Summarise groups over their attacks, each of which is a cell."""
-    figures = summary(drives, _GROUP, ["cell"], _SEED)
+    figures = summary(drives, _GROUP, ["cell"], seed=_SEED)
     if figures.empty:
         return []
     groups = drives.groupby(_GROUP, sort=False, dropna=False)
@@ -188,7 +188,7 @@ def _comparisons(drives: pd.DataFrame) -> list[dict[str, Any]]:
                     "other_method": other["method"],
                     "other_case": other["case"],
                 }
-                effect = asdict(compare(one, second, _ERROR, _SEED))
+                effect = asdict(compare(one, second, _ERROR, seed=_SEED))
                 left = asdict(compare_departures(one, second))
                 comparisons.append(
                     labels | reference | {"effect": effect, "departures": left}

@@ -130,7 +130,9 @@ def _offered(word: str) -> Offer:
     """Return what puts a condition of another package around an environment."""
     from mi_nerfattack.system import entry_points
 
-    offer = entry_points.find(entry_points.CONDITIONS, word, _WORDS, "--conditions: ")
+    offer = entry_points.find(
+        entry_points.CONDITIONS, word, _WORDS, where="--conditions: "
+    )
     if not callable(offer.value):
         raise offer.refuse(f"is {offer.value!r}, no class and no function")
     return offer
@@ -258,7 +260,7 @@ class Column:
             blur_px=blur,
             noise_sd=noise,
         )
-        deployment = Deployment(self.name, place, light, self.builds_in)
+        deployment = Deployment(self.name, place, light, builds_in=self.builds_in)
         return condition.around(deployment.open(objects))
 
 

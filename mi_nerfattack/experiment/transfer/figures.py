@@ -156,7 +156,7 @@ def column_figures(
     """
     by = ["environment", "condition", "case"]
     cases: dict[tuple[str, str], dict[str, Any]] = {}
-    for figures in records(summary(drives, by, ["attack"], seed)):
+    for figures in records(summary(drives, by, ["attack"], seed=seed)):
         environment, condition, case = (figures[name] for name in by)
         own = cases.setdefault((environment, condition), {})
         own[case] = {name: figures[name] for name in _OF_CASE}
@@ -274,7 +274,7 @@ def run_transfer(
 
     with locks.exclusive(output):
         locks.remove_partial(output)
-        run_drives(work, workers, progress, on_groups)
+        run_drives(work, workers, progress, on_groups=on_groups)
         plot_transfer(output / PICTURE, document)
         known = [s for s in document["surrogates"] if s["psnr_heldout_db"] is not None]
         if len(known) > 1:

@@ -142,7 +142,7 @@ class TransferDrives(AbstractDrives):
         column = column.without_objects if case == NO_OBJECT else column
         identity = _decisive(self.attacks[number], column, case)
         identity |= {"column": column.identity(), "case": case, "seed": self.seed}
-        return Batch(number, column, case, identify(column.name, identity))
+        return Batch(number, column, case, identity=identify(column.name, identity))
 
     def _spec(self, batch: Batch, start: int) -> DriveSpec:
         attack = self.attacks[batch.number]

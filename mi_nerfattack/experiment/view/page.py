@@ -118,7 +118,7 @@ def write_view(
         try:
             for step, pose in enumerate(viewed.cameras(drive)):
                 image = frames.see(drive, step)
-                apart = frames.difference(drive, step, image, NOWHERE)
+                apart = frames.difference(drive, step, image, moved=NOWHERE)
                 scene.look_from(pose, image)
                 scene.tell(describe(viewed, drive, step), apart)
                 recording.insert_sleep(viewed.world.scenario.vehicle.dt_s)

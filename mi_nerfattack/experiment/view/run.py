@@ -104,7 +104,9 @@ def read_viewed(folder: Path) -> ViewedRun:
             f"{folder / DRIVES}: no drives; they were removed, attack anew"
         )
     world = build_world(attack.scenario, attack.scenario.build_policy())
-    return ViewedRun(attack, world, {NO_OBJECT: None, **attack.looks(world)}, drives)
+    return ViewedRun(
+        attack, world, {NO_OBJECT: None, **attack.looks(world)}, drives=drives
+    )
 
 
 def drive_name(drive: Drive) -> str:

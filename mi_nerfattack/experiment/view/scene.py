@@ -86,7 +86,7 @@ def read_contents(
     viewed = read_viewed(folder)
     first = viewed.drive(drive)
     cloud = scene_cloud(viewed.world, first.poses, on_frame)
-    return Contents(viewed, first, cloud, object_shapes(viewed))
+    return Contents(viewed, first, cloud, shapes=object_shapes(viewed))
 
 
 def object_shapes(viewed: ViewedRun) -> list[ObjectShape]:
@@ -142,7 +142,9 @@ class RunScene:
         ):
             name = f"/objects/{item.id}"
             self._frames.append(scene.add_frame(name, show_axes=False))
-            self._looks.append(self._add_object(name, posed.pose.scale, field, shape))
+            self._looks.append(
+                self._add_object(name, posed.pose.scale, field, shape=shape)
+            )
         camera = viewed.world.surrogate.intrinsics
         high, wide = camera.height / (2 * camera.fy), camera.width / (2 * camera.fx)
         volume = float(np.cbrt(high * wide / 3))  # that viser scales to 1
@@ -236,14 +238,14 @@ class RunScene:
 
     def _add_lines(self) -> None:
         route = self._viewed.world.route
-        self._add_line("/route", route.points, _ROUTE, _THIN_M)
+        self._add_line("/route", route.points, _ROUTE, m=_THIN_M)
         first = {id(drive) for drive in self._viewed.shown}
         for drive in self._viewed.drives:
             colour = _rgb(CASE_COLOURS[drive.case])
             thick = _THICK_M if id(drive) in first else _THIN_M
             environment, case = drive_name(drive).split(": ")
             name = f"/drives/{environment}/{case}/{drive.run}"
-            self._add_line(name, drive.states[:, :2], colour, thick)
+            self._add_line(name, drive.states[:, :2], colour, m=thick)
 
     def _add_line(self, name: str, points: np.ndarray, colour: Any, m: float) -> None:
         """Draw a line through points (n, 2) of the ground."""

@@ -114,7 +114,7 @@ class Viewer:
                 self._put(number, pose.translation, to_wxyz(pose.rotation))
         try:
             image = self.frames.see(drive, step, moved=moved)
-            apart = self.frames.difference(drive, step, image, moved)
+            apart = self.frames.difference(drive, step, image, moved=moved)
         except NerfAttackError as err:  # as a simulator that does not run here
             self.description.content = f"**No frame**: {err}"
             return

@@ -152,7 +152,9 @@ class PackedGrid:
         result: list[mi.Float] = []
         for level in self._levels:
             index, weights = level.corners(unit, self.table.scale)
-            result += _mix(self.table, self._words, index, weights, active)
+            result += _mix(
+                self.table, self._words, index, weights=weights, active=active
+            )
         return result
 
 

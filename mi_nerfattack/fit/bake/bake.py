@@ -161,7 +161,7 @@ def bake(
             field.upper,
             occupancy=plan.occupancy,
             subdivisions=plan.subdivisions,
-            vertices=_first_vertices(scene, plan, codes, mount.height_m),
+            vertices=_first_vertices(scene, plan, codes, height_m=mount.height_m),
             codes=codes,
             sky=field.tensors()["sky"],
             step_m=field.step_m,
@@ -170,7 +170,9 @@ def bake(
         )
         progress(0, options.passes)
         for step in range(options.passes):
-            poses = drive_poses(routes, options.views, _seed(options, step), mount)
+            poses = drive_poses(
+                routes, options.views, _seed(options, step), mount=mount
+            )
             _refine(baked, scene, camera, poses=poses, options=options, step=step)
             progress(step + 1, options.passes)
     return baked

@@ -65,7 +65,7 @@ def score_bake(
         expected = field.render(camera, pose)
         depth = np.where(expected.opacity > SOLID, expected.depth, np.inf)
         name = f"{route.name}, {arc:.1f} m, {lateral:+.2g} m beside"
-        view = bricks.score(name, camera, pose, expected.image, depth=depth)
+        view = bricks.score(name, camera, pose, expected=expected.image, depth=depth)
         assert view.pictures is not None
         view = replace(
             view,

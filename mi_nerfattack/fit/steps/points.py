@@ -103,7 +103,7 @@ class PointStep:
         with dr.suspend_grad():
             depths = self.field.activate(raw, [raw, raw, raw])[0] * listed.width
             dr.eval(depths)
-            samples, slots = keep_visible(listed, depths, STOP, self.visible)
+            samples, slots = keep_visible(listed, depths, STOP, capacity=self.visible)
             heading = mi.Vector3f(
                 *(dr.gather(mi.Float, x, samples.ray) for x in rays.direction)
             )

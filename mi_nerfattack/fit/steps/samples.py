@@ -290,7 +290,7 @@ def cotangents(
             dr.dot(cotangent.radiance, value)
             + cotangent.opacity
             + cotangent.moment * dr.gather(mi.Float, samples.t, slot, active)
-            + spread.factor * spread.slope(weight, s, before, moment)
+            + spread.factor * spread.slope(weight, s, before, moment=moment)
         )
         before += weight
         moment += weight * s

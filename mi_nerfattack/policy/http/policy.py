@@ -37,7 +37,7 @@ class HttpPolicy(AbstractBlackBox):
         inputs: Inputs | None = None,
         token: str = "",
     ) -> None:
-        self.client: PolicyClient = PolicyClient(url, token, timeout_s, retries)
+        self.client: PolicyClient = PolicyClient(url, token, timeout_s, retries=retries)
         named, numbers = (inputs or Inputs()).names, (inputs or Inputs()).numbers
         self.sent: tuple[str, ...] = tuple(k for k in numbers.columns if k in named)
         AbstractBlackBox.__init__(

@@ -147,7 +147,9 @@ class PolicyServer(HttpServer):
                 raise RefusedError(422, f"the policy gives {controls.tolist()}")
             self._drives.pop(client, None)
             answer = controls.tolist()
-            self._drives[client] = _Drive(step, request, len(images), answer, after)
+            self._drives[client] = _Drive(
+                step, request, len(images), controls=answer, after=after
+            )
             if len(self._drives) > MAX_CLIENTS:
                 del self._drives[next(iter(self._drives))]
         with self._counting:

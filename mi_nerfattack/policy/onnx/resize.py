@@ -44,7 +44,7 @@ def resize(call: Call) -> torch.Tensor:
         size = x.shape[axis]
         if call.attribute("coordinate_transformation_mode") == "pytorch_half_pixel":
             _refuse_one(call, target)
-        positions = _positions(rule, size, target, scale)
+        positions = _positions(rule, size, target, scale=scale)
         if nearest:
             index = torch.from_numpy(positions.astype(np.int64)).to(x.device)
             x = x.index_select(axis, index)

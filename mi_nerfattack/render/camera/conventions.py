@@ -218,7 +218,7 @@ def from_mitsuba(sensor: mi.Sensor) -> tuple[Camera, np.ndarray]:
         # Our `opencv_camera`: its parameters are named as in COLMAP
         model = "OPENCV_FISHEYE" if "k3" in params else "OPENCV"
         numbers = [_number(params[name]) for name in COLMAP_MODELS[model]]
-        camera = from_colmap(model, width, height, numbers)
+        camera = from_colmap(model, width, height, parameters=numbers)
     elif "x_fov" in params:
         # A stock camera: a horizontal angle, and offsets in widths and heights
         focal = 0.5 * width / math.tan(math.radians(0.5 * _number(params["x_fov"])))

@@ -168,7 +168,7 @@ def disturbed(
         value = dr.linear_to_srgb(value * dr.gather(kind, gain, index))
     # The noise is normal in sRGB values, so it follows the encoding
     if noise_sd:
-        noise = standard_normal(kind, shape, seed, step, first)
+        noise = standard_normal(kind, shape, seed, step=step, first=first)
         value = value + dr.opaque(kind, noise_sd) * noise  # the image itself stays
         value = dr.clip(value, 0, 1)
     return type(image)(value, shape)

@@ -220,4 +220,4 @@ def generate_rays(
     # Now each ray has the pose of its image
     right, down, forward = (spread(mi.Vector3f(c)) for c in rotation)
     lens, origin = Lens([camera]).of(mi.UInt32(0)), spread(mi.Point3f(origin))
-    return lens_rays(lens, origin, (right, down, forward), position)
+    return lens_rays(lens, origin, (right, down, forward), position=position)

@@ -47,7 +47,7 @@ class Overhead:
         low, high = points.min(0) - margin_m, points.max(0) + margin_m
         edge = float((high - low).max()) / longest_px
         width, height = np.ceil((high - low) / edge - 1e-9).astype(int).tolist()
-        return Overhead((float(low[0]), float(low[1])), edge, width, height)
+        return Overhead((float(low[0]), float(low[1])), edge, width, height=height)
 
     @property
     def extent(self) -> tuple[float, float, float, float]:

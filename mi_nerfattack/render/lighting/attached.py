@@ -36,7 +36,7 @@ def attached(
     """
     # Stock integrators switch recorded loops off to be differentiated themselves.
     with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
-        return _attached(composite, posed, dr.detach(rays), stop)
+        return _attached(composite, posed, dr.detach(rays), stop=stop)
 
 
 def _attached(

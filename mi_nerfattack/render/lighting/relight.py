@@ -156,7 +156,9 @@ class Relighting:
             if walks:  # Mitsuba's shadow rays end at what light passes straight
                 used &= dr.isinf(nearest_surface(scene, it.spawn_ray_to(ds.p), used))
             passed = _transmittance(
-                objects, Rays(it.p, ds.d, end, mi.Float(0.5), used), self.stop
+                objects,
+                Rays(it.p, ds.d, end, jitter=mi.Float(0.5), active=used),
+                self.stop,
             )
             unshadowed += dr.select(used, light, 0)
             lit += dr.select(used, light * passed, 0)

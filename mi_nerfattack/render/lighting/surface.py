@@ -98,7 +98,7 @@ def expected_surface(shape: PosedField, rays: Rays, stop: float) -> Surface:
         )
         # dz/do, (3, n): through the march, and through the face of the box
         slope = by_rays.origin
-        slope += rate * _entry_slope(shape, rays, depth, active)
+        slope += rate * _entry_slope(shape, rays, depth, active=active)
         # The normal is parallel to dz/do, on the side that the ray comes from
         length = dr.norm(slope)
         clear = (length > 0) & (length < dr.inf) & (primal.opacity > FAINT)

@@ -258,7 +258,7 @@ def write_frame(path: str | Path, frame: Frame, precision: Precision) -> None:
     """
     suffix = Path(path).suffix.lower()
     if suffix == ".exr":
-        exr.write_layers(path, frame.channels, frame.metadata, precision == "half")
+        exr.write_layers(path, frame.channels, frame.metadata, half=precision == "half")
     elif suffix == ".png":
         files.write_image(path, to_srgb(path, frame))
     else:

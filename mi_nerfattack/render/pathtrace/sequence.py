@@ -81,7 +81,7 @@ def render_folder(
             something else, or another process works in the folder.
     """
     with locks.exclusive(files.make_folder(folder)):
-        return _render(shot, Path(folder), progress, lambda frame: frame)
+        return _render(shot, Path(folder), progress, select=lambda frame: frame)
 
 
 def render_video(
@@ -110,7 +110,7 @@ def render_video(
     # 8 bits clip what is too bright for 16-bit floats
     exact = replace(shot, precision="float")
     with locks.exclusive(files.make_folder(folder)):
-        paths = _render(exact, folder, progress, Frame.colour_only)
+        paths = _render(exact, folder, progress, select=Frame.colour_only)
         size = write_video(path, _read_srgb(paths), fps)
         for frame in paths:
             frame.unlink()

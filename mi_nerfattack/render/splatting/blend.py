@@ -119,14 +119,18 @@ def replay(
     window, place, active = _start(rays)
     tangent, by_origin, by_direction = March(), mi.Vector3f(0), mi.Vector3f(0)
     while active:
-        window, hit, is_hit = _next(rays, lists, shades, window, place, active)
+        window, hit, is_hit = _next(
+            rays, lists, shades, window=window, place=place, active=active
+        )
         with dr.resume_grad():
             # The splat again, attached to its shade and to the ray
             origin, direction = mi.Vector3f(rays.origin), mi.Vector3f(rays.direction)
             if dr.hint(with_rays, mode="scalar"):
                 dr.enable_grad(origin, direction)
             shade = dr.gather(mi.Vector4f, shades, hit.index, is_hit)
-            peak, opacity, _ = _meet(origin, direction, lists, shade, hit.index, is_hit)
+            peak, opacity, _ = _meet(
+                origin, direction, lists, shade=shade, index=hit.index, active=is_hit
+            )
             # dI/dc = w, dI/da = T c less what is behind
             colour = mi.Color3f(shade.xyz)
             weight, depth = passed * hit.opacity, dr.select(is_hit, hit.peak, 0)

@@ -101,7 +101,7 @@ def sort_rays(origin: mi.Point3f, direction: mi.Vector3f) -> Sorted:
     axes = _frames(direction, view, dr.width(origin))
     ahead = dr.dot(dr.gather(mi.Vector3f, axes[2], view), direction)
     if not dr.all(ahead > NARROW):
-        view, axes, origin = _faces(direction, view, axes, origin)
+        view, axes, origin = _faces(direction, view, axes, origin=origin)
     count = dr.width(axes[0])
     x, y, z = (dr.dot(dr.gather(mi.Vector3f, axis, view), direction) for axis in axes)
     place = [x / z, y / z]

@@ -119,7 +119,7 @@ def list_splats(shapes: Shapes, rays: Sorted) -> Lists | None:
     dr.scatter_reduce(dr.ReduceOp.Add, length, mi.UInt32(1), key >> shift)
     start = dr.prefix_sum(length)
     dr.eval(index, start, length)
-    return Lists(near, index, start, length)
+    return Lists(near, index, start, length=length)
 
 
 def _visible(shapes: Shapes, charts: Charts) -> mi.UInt32:
@@ -153,7 +153,7 @@ def _project(shapes: Shapes, charts: Charts, lane: mi.UInt32) -> tuple[Near, _Ex
     records = lay_out_fours([*rows[0], *rows[1], *rows[2], *turn(rows, -ahead)])
     axes, _ = gather_rows(shapes.axes, splat)
     extent = _extent(own, ahead, axes)
-    near = Near(splat, chart, ahead, records)
+    near = Near(splat, chart, ahead, records=records)
     dr.eval(near, extent)
     return near, extent
 

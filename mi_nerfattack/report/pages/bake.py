@@ -40,7 +40,7 @@ def write_bake_report(
     """
     root = files.make_folder(folder)
     colours, depths = root / "worst.png", root / "depth.png"
-    write_colours(colours, worst_views(views), "field", "bricks")
+    write_colours(colours, worst_views(views), "field", shown="bricks")
     write_depths(depths, worst_views(views), titles=("bricks", "field"))
     entries = [
         view.entry("route arc_m lateral_m psnr_db ssim")
@@ -57,7 +57,9 @@ def write_bake_report(
         "The bake": [{name: str(value) for name, value in facts.items()}],
     }
     metrics = {**facts, **bake_summary(views), "per_view": entries}
-    return write_report(root, title, bake_verdict(views), metrics, sections)
+    return write_report(
+        root, title, bake_verdict(views), metrics=metrics, sections=sections
+    )
 
 
 def bake_summary(views: Sequence[ViewScore]) -> dict[str, Any]:

@@ -82,7 +82,9 @@ def write_compare_report(folder: Path, comparison: Comparison, title: str) -> Pa
                 Picture(text, depths),
             ]
     text = verdict(judge_routes(comparison))
-    return write_report(root, title, text, document(comparison), sections)
+    return write_report(
+        root, title, text, metrics=document(comparison), sections=sections
+    )
 
 
 def document(comparison: Comparison) -> dict[str, Any]:

@@ -105,7 +105,9 @@ def write_fit_report(
         ],
         "Settings": [result.field.metadata()],
     }
-    return write_report(root, title, verdict(criteria), metrics, sections)
+    return write_report(
+        root, title, verdict(criteria), metrics=metrics, sections=sections
+    )
 
 
 def _judged(criteria: Sequence[Criterion]) -> Table:

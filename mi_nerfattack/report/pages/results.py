@@ -103,7 +103,7 @@ def _matrix(part: TransferPart) -> Table:
         Column(name.replace(",", ", "), lambda row, name=name: cell(row[1], name))
         for name in document["conditions"]
     ]
-    return Table("", labels, figures, lines, caption=caption)
+    return Table("", labels, figures, records=lines, caption=caption)
 
 
 def _commands(runs: Sequence[RunPart]) -> Table:
@@ -113,7 +113,7 @@ def _commands(runs: Sequence[RunPart]) -> Table:
     ]
     caption = "What makes each run again; RUN is a new folder."
     labels = [Column("run", lambda run: run.label)]
-    return Table("", labels, figures, runs, caption=caption)
+    return Table("", labels, figures, records=runs, caption=caption)
 
 
 def _beside(
@@ -127,4 +127,4 @@ def _beside(
 
     names = list(dict.fromkeys(name for column in columns for name in column))
     figures = [fact(index) for index in range(len(runs))]
-    return Table("", [Column("", str)], figures, names, caption=caption)
+    return Table("", [Column("", str)], figures, records=names, caption=caption)

@@ -155,7 +155,15 @@ def judge(
         figure: str, name: str, value: float, limit: float, at_least: bool, advice: str
     ) -> None:
         criteria.append(
-            Criterion(figure, name, value, limit, at_least, advice, subject)
+            Criterion(
+                figure,
+                name,
+                value,
+                limit=limit,
+                at_least=at_least,
+                advice=advice,
+                subject=subject,
+            )
         )
 
     psnr, worst = mean(scores, "psnr_db"), least(scores, "psnr_db")
@@ -163,28 +171,40 @@ def judge(
         "views",
         subject.views,
         len(scores),
-        MIN_VIEWS,
+        limit=MIN_VIEWS,
         at_least=True,
         advice=subject.few,
     )
     name = f"mean PSNR of {subject.views} (dB)"
-    add("psnr_db", name, psnr, MIN_PSNR_DB, at_least=True, advice=subject.blurred)
+    add("psnr_db", name, psnr, limit=MIN_PSNR_DB, at_least=True, advice=subject.blurred)
     name = f"least PSNR of {subject.views} (dB)"
-    add("psnr_min_db", name, worst, MIN_WORST_DB, at_least=True, advice=subject.worst)
+    add(
+        "psnr_min_db",
+        name,
+        worst,
+        limit=MIN_WORST_DB,
+        at_least=True,
+        advice=subject.worst,
+    )
     name = f"share of rays with an opacity from {HAZY[0]:g} to {HAZY[1]:g}"
     add(
-        "hazy", name, mean(scores, "hazy"), MAX_HAZY, at_least=False, advice=subject.fog
+        "hazy",
+        name,
+        mean(scores, "hazy"),
+        limit=MAX_HAZY,
+        at_least=False,
+        advice=subject.fog,
     )
     if not np.isnan(holes := mean(scores, "holes")):
         name = f"share of known surfaces with an opacity below {SOLID:g}"
-        add("holes", name, holes, MAX_HOLES, at_least=False, advice=subject.holes)
+        add("holes", name, holes, limit=MAX_HOLES, at_least=False, advice=subject.holes)
     if not np.isnan(depth_m):
         name = "median error of the depth near the camera (m)"
         add(
             "depth_median_m",
             name,
             depth_m,
-            MAX_DEPTH_M,
+            limit=MAX_DEPTH_M,
             at_least=False,
             advice=subject.depth,
         )
@@ -192,7 +212,9 @@ def judge(
         pooled = pooled_db([score.psnr_db for score in scores])
         gap = 0.0 if pooled == fitted_db else fitted_db - pooled  # both may be infinite
         name = "PSNR of fitted rays less that of held-out ones (dB)"
-        add("gap_db", name, gap, MAX_GAP_DB, at_least=False, advice=subject.learnt)
+        add(
+            "gap_db", name, gap, limit=MAX_GAP_DB, at_least=False, advice=subject.learnt
+        )
     return criteria
 
 

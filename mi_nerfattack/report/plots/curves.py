@@ -105,7 +105,7 @@ def damage(path: str | Path, methods: Mapping[str, Curves]) -> None:
         for number, (method, curves) in enumerate(methods.items()):
             color = PALETTE[number % len(PALETTE)]
             style = _DASHES[number // len(PALETTE) % len(_DASHES)]
-            _draw(axis, curves, f"{method} ({len(curves)})", color, style)
+            _draw(axis, curves, f"{method} ({len(curves)})", color=color, style=style)
         title = "best so far in the surrogate; median and range of so many attacks"
         _label(axis, title, "frames rendered, or their cost")
         figure.legend(loc="outside lower center", ncols=4, frameon=False)

@@ -108,7 +108,7 @@ def errors(
             for axis, environment in zip(row, environments, strict=True):
                 for case in cases:
                     group = drives.get((environment, route, case), ())
-                    _draw_errors(axis, case, group, signed)
+                    _draw_errors(axis, case, group, signed=signed)
                 label = f"departure limit {limits[route]:.2f} m"
                 for limit in (limits[route], -limits[route])[: 1 + signed]:
                     axis.axhline(limit, **_LIMIT, label=label)

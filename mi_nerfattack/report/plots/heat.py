@@ -130,7 +130,7 @@ def side_views(
     """
     values = surface_heat(grid, gradient)
     largest = values.max() or 1.0  # keeps the march in a good range of numbers
-    around = Around(grid.lower, grid.upper, list(SIDES.values()), edge_px)
+    around = Around(grid.lower, grid.upper, list(SIDES.values()), edge_px=edge_px)
     heats = around.views(MagnitudeField(grid, values / largest))
     views = []
     for name, look, (heat, _) in zip(SIDES, around.views(grid), heats, strict=True):

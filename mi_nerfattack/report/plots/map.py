@@ -76,7 +76,7 @@ def overhead(
         Panel(f"{route.name}: {name}", group, object_footprints)
         for name, group in groups.items()
     ]
-    write_maps(path, panels, route, limit, (left, right, bottom, top))
+    write_maps(path, panels, route, limit=limit, extent=(left, right, bottom, top))
 
 
 def write_maps(

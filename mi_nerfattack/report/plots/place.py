@@ -133,14 +133,14 @@ def place_picture(
         rows[0, 0].suptitle(title, x=0.01, ha="left", fontweight="bold")
         for k, (name, image) in enumerate(grounds.items()):
             axis = rows[0, 0].add_subplot(1, len(grounds), k + 1)
-            _draw_ground(axis, overlay, overhead, name, image)
+            _draw_ground(axis, overlay, overhead, name=name, image=image)
         _draw_legend(rows[1, 0], rows[0, 0].axes[0])
         if looks:
             axes = rows[2, 0].subplots(
                 1, len(looks), width_ratios=shapes, squeeze=False
             )
             for axis, (name, look) in zip(axes[0], looks.items(), strict=True):
-                _draw_look(axis, overlay, name, look)
+                _draw_look(axis, overlay, name, look=look)
         if lines:
             for k, (line, text) in enumerate(lines):
                 colour = _SENTENCE_COLOURS.get(text.partition(":")[0], "black")
@@ -185,7 +185,7 @@ def routes_picture(
         pose = mount_matrix(route.pose_at(0.0)[None], mount or CameraMount())[0]
         shown = view.render(pose, 0).image
         looks[f"Start of {route.name}"] = Look(shown, camera, pose)
-    place_picture(path, overlay, overhead, grounds, looks, title=title)
+    place_picture(path, overlay, overhead, grounds=grounds, looks=looks, title=title)
 
 
 def _draw_legend(figure: Any, axis: Any) -> None:

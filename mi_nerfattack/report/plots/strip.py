@@ -45,7 +45,7 @@ class Around:
         edge_px: int,
     ) -> None:
         self._poses = [_pose(lower, upper, azimuth) for azimuth in azimuths_deg]
-        self._camera = _camera(lower, upper, self._poses, edge_px)
+        self._camera = _camera(lower, upper, self._poses, edge_px=edge_px)
 
     def views(self, field: AbstractField) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield premultiplied radiance (height, width, 3) and opacity by eye."""
@@ -71,7 +71,7 @@ def turntable(grid: GridField, count: int, edge_px: int) -> list[np.ndarray]:
         sRGB images over white, (height, width, 3), uint8.
     """
     azimuths = np.linspace(0, 360, count, endpoint=False)
-    around = Around(grid.lower, grid.upper, azimuths.tolist(), edge_px)
+    around = Around(grid.lower, grid.upper, azimuths.tolist(), edge_px=edge_px)
     views = [over_paper(*look) for look in around.views(grid)]
     return [(255 * view).round().astype(np.uint8) for view in views]
 
@@ -105,7 +105,7 @@ def _camera(
     reach = np.max(slopes, axis=0)
     focal = 0.5 * edge_px / reach.max()
     width, height = (max(1, int(size)) for size in np.ceil(2 * focal * reach))
-    return Camera(width, height, focal, focal, width / 2, height / 2)
+    return Camera(width, height, focal, fy=focal, cx=width / 2, cy=height / 2)
 
 
 SCALE = 2

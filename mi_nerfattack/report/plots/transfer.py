@@ -68,7 +68,7 @@ def plot_transfer(path: str | Path, document: Mapping[str, Any]) -> None:
                 value, text = line.cells.get(condition, (0.0, ""))
                 colour = "black" if value > LIGHT * most else "white"
                 axis.text(column, row, text, color=colour, **_CENTRED)
-        _label(axis, conditions, [line.label for line in lines], names)
+        _label(axis, conditions, [line.label for line in lines], names=names)
         bar = figure.colorbar(image, ax=axis, shrink=0.6, pad=0.01)
         bar.set_label("mean distance from the lane centre (m)")
         axis.set_title(

@@ -40,9 +40,9 @@ def write_colours(
             error = np.abs(pair.shown.image - pair.expected).mean(axis=2)
             axes[0].imshow(np.clip(pair.expected, 0, 1), interpolation="nearest")
             axes[1].imshow(np.clip(pair.shown.image, 0, 1), interpolation="nearest")
-            _map(axes[2], error, _ERRORS, scale)
+            _map(axes[2], error, _ERRORS, scale=scale)
         label = "difference of sRGB values (0 to 1), mean of the channels"
-        _bar(figure, rows, _ERRORS, scale, label)
+        _bar(figure, rows, _ERRORS, scale=scale, label=label)
 
 
 def write_depths(
@@ -73,13 +73,19 @@ def write_depths(
     with chart(path, _height(pictures, 3 if known else 2)) as figure:
         rows = _panels(figure, views, columns)
         for i, axes in enumerate(rows):
-            _map(axes[0], shown[i], _DEPTHS, scale)
+            _map(axes[0], shown[i], _DEPTHS, scale=scale)
             if known:
-                _map(axes[1], known_depths[i], _DEPTHS, scale)
-                _map(axes[2], errors[i], _ERRORS, error_scale)
-        _bar(figure, rows, _DEPTHS, scale, f"depth along the ray ({unit})")
+                _map(axes[1], known_depths[i], _DEPTHS, scale=scale)
+                _map(axes[2], errors[i], _ERRORS, scale=error_scale)
+        _bar(figure, rows, _DEPTHS, scale=scale, label=f"depth along the ray ({unit})")
         if known:
-            _bar(figure, rows, _ERRORS, error_scale, f"difference of depths ({unit})")
+            _bar(
+                figure,
+                rows,
+                _ERRORS,
+                scale=error_scale,
+                label=f"difference of depths ({unit})",
+            )
 
 
 #: Below each other: label, factor, figures with their dashes, and what they are.

@@ -194,7 +194,7 @@ class ProgramSection(AbstractNetworkSection):
             network = _load_onnx(path)
             network.choose(self._names, len(self.recurrent))
             batch = network.batch
-        return self.policy_of(network, views, batch, self.recurrent)
+        return self.policy_of(network, views, batch, recurrent=self.recurrent)
 
 
 class DrJitSection(AbstractNetworkSection):
@@ -222,7 +222,9 @@ class CallableSection(AbstractPolicySection):
         """Load the function."""
         preprocess, inputs = self.preprocess.build(), self.build_inputs(views)
         function = self.file.load("policy.file", self.trust_code)
-        return CallablePolicy(function, self.source, preprocess, self.action(), inputs)
+        return CallablePolicy(
+            function, self.source, preprocess, action=self.action(), inputs=inputs
+        )
 
 
 class HttpSection(AbstractPolicySection):
@@ -295,7 +297,7 @@ def load_policy(
     Raises:
         InputError: a key or a file cannot be used, see `AbstractPolicySection.build`.
     """
-    return read_section("policy", PolicySection, dict(keys), folder).build(views)
+    return read_section("policy", PolicySection, dict(keys), folder=folder).build(views)
 
 
 def build_differentiable(

@@ -78,7 +78,9 @@ class PreprocessSection(Section):
             transforms.append(COLOURS[self.colour]())
         if (self.scale, self.mean, self.std) != (1.0, (0.0,), (1.0,)):
             transforms.append(Normalise(self.scale, self.mean, self.std))
-        return Preprocess(transforms, self.frames, self.stride, LAYOUTS[self.layout])
+        return Preprocess(
+            transforms, self.frames, self.stride, layout=LAYOUTS[self.layout]
+        )
 
 
 class TrajectorySection(Section):

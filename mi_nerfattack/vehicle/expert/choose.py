@@ -85,7 +85,14 @@ def expert_for(
     Raises:
         InputError: unknown unit, or a number out of range.
     """
-    _Vehicle(control_unit, period, max_control, wheelbase, lag, acceleration)
+    _Vehicle(
+        control_unit,
+        period,
+        max_control,
+        wheelbase=wheelbase,
+        lag=lag,
+        acceleration=acceleration,
+    )
     if control_unit == "rad" and max_control >= math.pi / 2:
         raise InputError(f"expert.max_control: {max_control!r} rad; below pi/2")
     speed = float(route.speed_ms)

@@ -190,8 +190,8 @@ def future_positions(
             rate = heading_rate(rate, speed, wheelbase)
         for index in np.flatnonzero(full_periods == step):
             seconds = max(0.0, ahead[index] - step * period)
-            world[:, index] = _along_arc(state, rate, speed, seconds)[:, :2]
-        state = _along_arc(state, rate, speed, period)
+            world[:, index] = _along_arc(state, rate, speed, seconds=seconds)[:, :2]
+        state = _along_arc(state, rate, speed, seconds=period)
     offset, heading = world - start[:, None, :2], start[:, 2:]
     dx, dy = offset[..., 0], offset[..., 1]
     cos, sin = np.cos(heading), np.sin(heading)

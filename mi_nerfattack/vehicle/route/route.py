@@ -27,7 +27,9 @@ from mi_nerfattack.vehicle.route.polyline import (
 )
 
 _NEEDED = ("goal", "points_m", "lane_width_m", "speed_ms")
-_NUMPY = Operations(np.where, np.sqrt, np.sin, np.cos, np.arctan2, detach=lambda x: x)
+_NUMPY = Operations(
+    np.where, np.sqrt, np.sin, cos=np.cos, arctan2=np.arctan2, detach=lambda x: x
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,9 +211,9 @@ class Route:
         """
         x, y, theta = np.atleast_2d(np.asarray(states, np.float64)).T[:3]
         every = Segment(*self.segments.T)
-        square = square_distance(_NUMPY, every, x[:, None], y[:, None])
+        square = square_distance(_NUMPY, every, x[:, None], y=y[:, None])
         nearest = Segment(*self.segments[np.argmin(square, axis=1)].T)
-        return measure(_NUMPY, nearest, x, y, theta)
+        return measure(_NUMPY, nearest, x, y=y, theta=theta)
 
     def cross_track_numpy(self, states: Any) -> np.ndarray:
         """Signed cross-track error (n,) in metres of states (n, m)."""
@@ -332,13 +334,15 @@ def _project(segments: np.ndarray, state: Any) -> Measures:
     """Find the nearest point of the segments, as `Route.project` does."""
     import drjit as dr
 
-    drjit = Operations(dr.select, dr.sqrt, dr.sin, dr.cos, dr.atan2, dr.detach)
+    drjit = Operations(
+        dr.select, dr.sqrt, dr.sin, cos=dr.cos, arctan2=dr.atan2, detach=dr.detach
+    )
     real: Any = dr.detached_t(type(state[0]))
     stored, detached = _Segments(segments, real), dr.detach(state)
     px, py = real(detached[0]), real(detached[1])
 
     def measure_one(i: Any, best: Any, shortest: Any) -> tuple[Any, Any, Any]:
-        square = square_distance(drjit, stored.at(i), px, py)
+        square = square_distance(drjit, stored.at(i), px, y=py)
         closer = square < shortest
         return i + 1, dr.select(closer, i, best), dr.select(closer, square, shortest)
 
@@ -351,7 +355,7 @@ def _project(segments: np.ndarray, state: Any) -> Measures:
         labels=("segment", "nearest", "square_distance"),
         mode="symbolic",
     )
-    return measure(drjit, stored.at(nearest), state[0], state[1], state[2])
+    return measure(drjit, stored.at(nearest), state[0], y=state[1], theta=state[2])
 
 
 def smooth_absolute(error: Any, width: float = 0.05) -> Any:

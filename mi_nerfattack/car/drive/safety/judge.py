@@ -131,7 +131,13 @@ class Judge:
     def frame(self, frame: Frame | None, now_s: float) -> None:
         """Judge the camera's newest frame."""
         time = None if frame is None else frame.time_s
-        _check_age(Cause.FRAME_OLD, "the newest frame", time, now_s, self.ages.frame_s)
+        _check_age(
+            Cause.FRAME_OLD,
+            "the newest frame",
+            time,
+            now_s=now_s,
+            limit_s=self.ages.frame_s,
+        )
 
     def pose(
         self,
@@ -196,7 +202,13 @@ class Judge:
         """
         limit = self.ages.frame_s + (0.0 if is_new else self.period_s)
         time = None if decision is None else decision.frame_time_s
-        _check_age(Cause.DECISION_OLD, "the frame of the decision", time, now_s, limit)
+        _check_age(
+            Cause.DECISION_OLD,
+            "the frame of the decision",
+            time,
+            now_s=now_s,
+            limit_s=limit,
+        )
         assert decision is not None
         if not math.isfinite(decision.control):
             raise Stop(Cause.NOT_FINITE, f"the policy gave {decision.control}")
