@@ -151,10 +151,15 @@ def attack(drives: pd.DataFrame) -> Finding:
 
 
 def country(drives: pd.DataFrame) -> Finding:
-    """Do the same as `attack` at the second place, with its policy."""
-    made = attack(drives)
-    title = made.title[0].lower() + made.title[1:]
-    return replace(made, title=f"On a country road, with another policy, {title}")
+    """Do the same as `attack` at the second place; say how many cars leave the lane."""
+    made, deployed = attack(drives), drives["environment"] != SURROGATE
+    out = drives[deployed & (drives["case"] == ATTACK)]["departed"]
+    lane = f"and out of its lane in {out.sum()} of {len(out)} drives"
+    title = made.title.replace(" than the worst random texture", "").replace(
+        "T", "t", 1
+    )
+    lane = lane if out.any() else "but never out of its lane"
+    return replace(made, title=f"On a country road, {title}, {lane}")
 
 
 def _threats_to_attack(

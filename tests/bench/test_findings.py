@@ -174,8 +174,12 @@ def test_the_second_place_has_the_rule_of_the_first():
     cases = ("no_object", "random", "best_random", "attack")
     errors = {case: [0.1 + 0.1 * k] * 6 for k, case in enumerate(cases)}
     rows = drives(table(errors), table(errors).assign(environment="mitsuba"))
-    answer = made("country", rows)
-    assert answer.title.startswith("On a country road") and "6 of 6" in answer.title
+    road = "On a country road, the attack moves the car farther at 6 of 6 places, "
+    assert made("country", rows).title == f"{road}but never out of its lane"
+    rows.loc[rows["case"] == "attack", "departed"] = True
+    left = made("country", rows)
+    assert left.title == f"{road}and out of its lane in 6 of 6 drives"
+    assert "at 6 of 6 places. " in left.sentences[1]
 
 
 def test_the_parts_of_varying_are_compared_with_nothing():
