@@ -6,11 +6,12 @@ import itertools
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import tyro
 
-from bench.results import command_of, progress, read_sizes, stamp
+from bench.results import progress, publish, read_sizes
 from bench.tables import markdown
 from bench.worker import Worker, medians
 from mi_nerfattack.commands.shared.terminal import Result
@@ -44,6 +45,8 @@ class BenchLoop:
     """Width and height of the image, pixels."""
     repeats: Count = 1
     """Gradients to time; the median counts."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Also write the result: a .json file, or a folder in which it gets a name."""
     json: bool = False
     """Print one line of JSON instead of the table."""
 
@@ -68,7 +71,7 @@ class BenchLoop:
             "gradient_difference": _largest_difference(gradients),
             "loss_difference": _largest_difference([np.array(r["loss"]) for r in rows]),
         }
-        document = stamp(document, command_of("loop", self))
+        document = publish("loop", self, document)
         code = int(document["gradient_difference"] > AGREED)
         return Result(document, lambda: print(*lines(document), sep="\n"), code)
 

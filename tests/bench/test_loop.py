@@ -52,9 +52,12 @@ def measured(monkeypatch, tmp_path) -> None:
     monkeypatch.setattr(bench, "measure", measure)
 
 
-def test_gradients_that_differ_are_an_error(measured, capsys):
-    assert main(["loop", "--frames", "3", "--size", "24x12", "--json"]) == 1
+def test_gradients_that_differ_are_an_error(measured, capsys, tmp_path):
+    words = ["loop", "--frames", "3", "--size", "24x12", "-o", str(tmp_path), "--json"]
+    assert main(words) == 1
     document = json.loads(capsys.readouterr().out)
+    (file,) = tmp_path.glob("*-loop.json")
+    assert json.loads(file.read_text()) == document
     assert document["frames"] == 3 and document["size"] == [24, 12]
     assert document["gradient_difference"] == pytest.approx(1 - 1.01**-5, rel=1e-4)
     assert document["loss_difference"] == 0
