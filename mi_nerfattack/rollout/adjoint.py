@@ -64,7 +64,7 @@ class Replay(AbstractAdjoint):
     independent of the horizon: up to four images wait for the policy's derivative.
     Time: a backward pass renders every frame once more, then costs a product with the
     policy's derivative, and march derivatives of the rays that meet objects; forward
-    and backward together about 2.4 forward passes.
+    and backward together about 2.2 forward passes.
     """
 
     kind: Literal["replay"] = "replay"

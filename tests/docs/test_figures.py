@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 from support.pages.measured import page, results
 
+from bench.loop.bench import POLICIES, WAYS
 from bench.studies.light import light
 from mi_nerfattack.experiment.sweep.table import read_table
 from mi_nerfattack.io import files
@@ -20,7 +21,6 @@ ROOT = Path(__file__).parents[2]
 FIGURES = files.read_toml(ROOT / "bench/figures.toml")
 # Figures that only their page has, by page; a count may only fall.
 PENDING = {
-    "docs/results/attack_speed.md": 1,
     "docs/results/attack_size.md": 1,
     "docs/results/photographs.md": 1,
     "docs/results/fields.md": 2,
@@ -54,7 +54,7 @@ def test_the_table_of_rendering_equals_its_file():
             ("backward", "backward"),
             ("both", "forward_and_backward"),
         ):
-            ours, peer = (row[f"{p}{key}_samples_per_s"] for p in ("", "torch_tuned_"))
+            ours, peer = (row[f"{p}{key}_samples_per_s"] for p in ("", "torch_"))
             figures = f"{ours / 1e6:.3f} | {peer / 1e6:.3f} | {ours / peer:.1f}"
             assert f"| {size} {name} | {figures} |" in text
 
@@ -185,9 +185,15 @@ def test_the_table_of_coarse_colours_equals_its_rows():
 def test_the_table_of_fits_equals_its_file():
     text = page("rendering")
     for row in results("fit")["steps"]:
-        ours, peer = (row[f"{p}seconds_per_step"] for p in ("", "torch_tuned_"))
+        ours, peer = (row[f"{p}seconds_per_step"] for p in ("", "torch_"))
         figures = f"{1e3 * ours:.0f} | {1e3 * peer:.0f} | {peer / ours:.1f}"
         assert f"| {row['network']}, {row['stage']} | {figures} |" in text
+
+
+def span(values: list[float], digits: int) -> str:
+    """Return the least and the largest value as words; one number if they agree."""
+    ends = (f"{value:.{digits}f}" for value in (min(values), max(values)))
+    return " to ".join(dict.fromkeys(ends))
 
 
 def test_the_table_of_attacks_equals_its_file():
@@ -216,13 +222,13 @@ def test_the_table_of_attacks_equals_its_file():
     again = [row["replay_seconds"] / row["rollout_seconds"] for row in rows]
     faster = [row["torch_seconds"] / row[f"{adjoint}_seconds"] for row in rows]
     words = " ".join(text.split())
-    assert f"as long as {min(drives):.1f} to {max(drives):.1f} drives" in words
-    assert f"{min(faster):.0f} to {max(faster):.0f} times as fast" in words
-    assert f"`replay` needs {min(again):.1f} to {max(again):.1f} drives" in words
+    assert f"as long as {span(drives, 1)} drives" in words
+    assert f"{span(faster, 0)} times as fast" in words
+    assert f"`replay` needs {span(again, 1)} drives" in words
     slower = [row["torch_seconds"] / row["replay_seconds"] for row in rows]
     main = " ".join(page("bench").split())
     for some in (faster, slower):
-        assert f"{min(some):.0f} to {max(some):.0f} times as fast" in main
+        assert f"{span(some, 0)} times as fast" in main
     shares = [row["settings"]["ours"] for row in rows]
     cells = " | ".join(
         f"{100 * x['object_share_mean']:.1f} %, {100 * x['object_share_max']:.1f} %"
@@ -236,6 +242,23 @@ def test_the_table_of_attacks_equals_its_file():
     ):
         cells = " | ".join(f"{1e3 * row[f'{key}_seconds']:.0f}" for row in rows)
         assert f"| {name} | {cells} |" in text
+
+
+def test_the_table_of_the_loop_equals_its_file():
+    text, document = page("attack_speed"), results("loop")
+    seconds = {"plain": [], "rollout": []}
+    for row in document["rows"]:
+        cells = f"{row['seconds']:.1f} s | {row['cpu_seconds']:.1f} s"
+        policy, way = POLICIES[row["policy"]], WAYS[row["way"]]
+        memory = f"{row['peak_memory_mb']:.0f} MB"
+        assert f"| {way} | {policy} | {cells} | {memory} |" in text
+        seconds["plain" if row["way"] == "plain" else "rollout"].append(row["seconds"])
+    words = " ".join(text.split())
+    for verb, some in (("in", seconds["rollout"]), ("needs", seconds["plain"])):
+        assert f"{verb} {span(some, 1)} s" in words
+    for kind in ("gradient", "loss"):
+        most = f"{document[f'{kind}_difference']:.1e}".replace("e-0", "e-")
+        assert f"at most {most}" in words
 
 
 def test_the_table_of_scaling_equals_its_file():
