@@ -13,7 +13,9 @@ import pytest
 from support.pages.measured import page, results
 
 from bench.loop.bench import POLICIES, WAYS
+from bench.studies.findings import finding
 from bench.studies.light import light
+from bench.studies.plan import read_plan
 from mi_nerfattack.experiment.sweep.table import read_table
 from mi_nerfattack.io import files
 
@@ -73,6 +75,15 @@ def test_the_figures_of_the_country_road_equal_their_files():
     routes = files.read_json(place / "field/metrics.json")["routes"].values()
     psnr = sum(route["psnr_mean_db"] for route in routes) / len(routes)
     assert f"along both routes is about {psnr:.0f} dB" in text
+
+
+def test_the_readme_says_what_the_rows_of_the_country_road_say():
+    (study,) = (one for one in read_plan().studies if one.name == "country")
+    made = finding(study)
+    assert made is not None
+    assert "at 16 of 16 places, but never out of its lane" in made.title
+    readme = " ".join((ROOT / "README.md").read_text("utf-8").split())
+    assert "At all 16 places on [a country road]" in readme
 
 
 def test_the_table_of_the_demo_equals_its_rows():
