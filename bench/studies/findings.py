@@ -9,76 +9,46 @@ nothing.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any
 
 import pandas as pd
 
+from bench.studies.attack import CASES, attack, country, is_farther, place_name
 from bench.studies.charts import (
-    draw_places,
     draw_ratios,
     draw_searches,
     draw_shares,
 )
 from bench.studies.content import (
     ERROR,
-    HALF,
     Finding,
     ends_cell,
     interval_words,
     metres,
 )
 from bench.studies.fit_quality import fit_quality
-from bench.studies.light import light
 from bench.studies.limits import limits
-from bench.studies.parts import vary_parts
 from bench.studies.plan import Study, state
 from bench.studies.transfer import transfer
+from bench.studies.vary import light, vary_parts
 from mi_nerfattack.drives.table import records, with_starts
-from mi_nerfattack.evaluation.pairs import Effect, compare
+from mi_nerfattack.evaluation.pairs import compare
 from mi_nerfattack.evaluation.summary import (
     share_interval,
     summary,
 )
 from mi_nerfattack.experiment.sweep.summary import GRADIENT
-from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, NO_OBJECT, RANDOM
+from mi_nerfattack.rollout.drive import ATTACK, RANDOM
 from mi_nerfattack.scenario.deployment import SURROGATE
 
 _BY_GRADIENT = ("attached", "open_loop", "single_frame")
 EQUAL = 0.8  # of the gradient's frames, from which on a search has an equal budget
-_CASES = {
-    NO_OBJECT: "no object",
-    RANDOM: "random textures",
-    BEST_RANDOM: "worst random texture",
-    ATTACK: "attack",
-}
+
 _OF_SEARCHES = (
     "attacks = drives.query(\"case == 'attack' and environment == 'surrogate'\")\n"
     'print(attacks.groupby(["method", "route"]).cross_track_mean_m.mean().unstack())'
 )
-
-
-def is_farther(one: pd.DataFrame, other: pd.DataFrame) -> tuple[int, bool]:
-    """Count the places where one side's mean error is larger than the other's.
-
-    Args:
-        one: drives of one environment, case and method.
-        other: as `one`, at the same places.
-
-    Returns:
-        The number of places, and whether Wilson's interval of their share lies above
-        `HALF`.
-    """
-    means = _by_place(one)
-    count = int((means > _by_place(other).reindex(means.index)).sum())
-    return count, is_majority(count, len(means))
-
-
-def is_majority(count: int, places: int) -> bool:
-    """Whether Wilson's interval of a share of the places lies above `HALF`."""
-    ends = share_interval(count, places)
-    return ends is not None and ends[0] > HALF
 
 
 def finding(study: Study) -> Finding | None:
@@ -95,109 +65,6 @@ def finding(study: Study) -> Finding | None:
         return made
     exist = f"{one.done} of {one.wanted} {study.units} exist"
     return replace(made, title=f"Not yet known {question}: {exist}")
-
-
-def attack(drives: pd.DataFrame) -> Finding:
-    """Compare the attack with the worst random texture of equal cost."""
-    where = next(name for name in drives["environment"].unique() if name != SURROGATE)
-    own = drives[drives["environment"] == where]
-    by_case = {case: own[own["case"] == case] for case in _CASES}
-    attacks, randoms = by_case[ATTACK], by_case[BEST_RANDOM]
-    effect = compare(attacks, randoms, ERROR)
-    count, is_shown = is_farther(attacks, randoms)
-    places = f"{count} of {effect.attacks} places"
-    title = (
-        f"The attack moves the car farther than the worst random texture at {places}"
-    )
-    if not is_shown:
-        title = f"The attack is not shown to be better than random textures: {places}"
-    groups = summary(drives, ["environment", "case"], ["cell"])
-    rows = [
-        [
-            *(_CASES[row["case"]], row["environment"], f"{row[ERROR]:.3f}"),
-            ends_cell(row["cross_track_mean_ci95_m"]),
-            f"{row['attacks_out']}/{row['attacks']}",
-        ]
-        for row in records(groups)
-        if row["case"] in _CASES
-    ]
-    out = int(summary(by_case[ATTACK], ["case"], ["cell"])["attacks_out"].iloc[0])
-    errors = pd.DataFrame({n: _by_place(by_case[case]) for case, n in _CASES.items()})
-    errors.index = [_name(place) for place in errors.index]
-    return Finding(
-        title=title,
-        sentences=(
-            f"In the environment `{where}`, the attack moves the car {effect.one:.3f} "
-            f"m from the lane centre on average, and the worst random texture "
-            f"{effect.other:.3f} m (ratio {effect.ratio:.1f}, "
-            f"{interval_words(effect.ratio_ci95, 1)}).",
-            f"The attack is farther at {places}. At {out} of {effect.attacks} places, "
-            "a wheel is out of the lane for 1 s or more with the attack, on average "
-            "over the drives (share: "
-            f"{interval_words(share_interval(out, effect.attacks), 2)}).",
-            f"The difference is {effect.difference:.3f} m on average. Its standard "
-            f"deviation between the places of a route is {metres(effect.spread)}.",
-        ),
-        head=[
-            *("texture", "environment", "mean error (m)", "95 % interval"),
-            "places with a wheel out for 1 s",
-        ],
-        rows=rows,
-        draw=lambda figure: draw_places(figure, errors),
-        pandas=f'deployed = drives[drives.environment == "{where}"]\n'
-        'print(deployed.groupby(["route", "case"]).cross_track_mean_m.mean())',
-        threats=tuple(_threats_to_attack(by_case, effect)),
-    )
-
-
-def country(drives: pd.DataFrame) -> Finding:
-    """Do the same as `attack` at the second place; say how many cars leave the lane."""
-    made, deployed = attack(drives), drives["environment"] != SURROGATE
-    out = drives[deployed & (drives["case"] == ATTACK)]["departed"]
-    lane = f"and out of its lane in {out.sum()} of {len(out)} drives"
-    title = made.title.replace(" than the worst random texture", "").replace(
-        "T", "t", 1
-    )
-    lane = lane if out.any() else "but never out of its lane"
-    return replace(made, title=f"On a country road, {title}, {lane}")
-
-
-def _threats_to_attack(
-    by_case: Mapping[str, pd.DataFrame], effect: Effect
-) -> Iterator[str]:
-    """Yield what speaks against the finding about the attack.
-
-    Args:
-        by_case: drives in the deployment environment.
-        effect: attack and worst random texture, compared.
-    """
-    if effect.ratio_ci95 is not None and effect.ratio_ci95[0] <= 1:
-        yield (
-            "The interval of the ratio of the means contains 1, because a few attacks "
-            "are much stronger than the others. So the title counts places."
-        )
-    if effect.spread is not None and effect.spread > effect.difference:
-        yield (
-            "The spread between places is larger than the mean difference, so one more "
-            "place can change the mean a lot."
-        )
-    own, random = by_case[ATTACK], by_case[BEST_RANDOM]
-    cost, most = random["frames"].max(), own["frames"].max()
-    yield (
-        "The worst random texture is the one with the largest error in the surrogate. "
-        f"The random textures cost {cost:,} frames, and the attack up to {most:,}, so "
-        f"they had {100 * cost / most:.0f} % of its budget. At the intersection, "
-        "[another study](gradient.md) compares at equal cost."
-    )
-    left = own.groupby("route", sort=False)["departed"].agg(["sum", "size"])
-    counts = ", ".join(f"{route} {x} of {n}" for route, x, n in left.itertuples())
-    yield f"Drives with the attack that leave the lane, by route: {counts}."
-    means = _by_place(own)
-    yield (
-        f"One place, {_name(means.idxmax())}, has a mean error of {means.max():.2f} m. "
-        "The mean over the other places is "
-        f"{means.drop(means.idxmax()).mean():.2f} m."
-    )
 
 
 def gradient(drives: pd.DataFrame) -> Finding:
@@ -279,8 +146,8 @@ def _threats_to_gradient(
         error = errors[GRADIENT]
         names = ", ".join(f"`{name}`" for name in fair if errors[name] > error)
         yield (
-            f"At {_name(place)}, the gradient has {error:.2f} m, and these searches "
-            f"have more: {names}."
+            f"At {place_name(place)}, the gradient has {error:.2f} m, and these "
+            f"searches have more: {names}."
         )
 
 
@@ -323,11 +190,11 @@ def flat(drives: pd.DataFrame) -> Finding:
         own.groupby("case")["departed"].agg(statistic).astype(int)
         for statistic in ("sum", "count")
     )
-    shares = {name: left[c] / count[c] for c, name in _CASES.items() if c in left}
+    shares = {name: left[c] / count[c] for c, name in CASES.items() if c in left}
     places = own[own["case"] == ATTACK].groupby("cell")["departed"].any()
     out, all_places = int(places.sum()), len(places)
     ends = share_interval(out, all_places)
-    percent = f"{100 * shares[_CASES[ATTACK]]:.0f} %"
+    percent = f"{100 * shares[CASES[ATTACK]]:.0f} %"
     title = f"Flat objects send the car out of its lane in {percent} of the drives"
     kinds = summary(own, ["objects", "case"], ["cell"])
     return Finding(
@@ -350,11 +217,11 @@ def flat(drives: pd.DataFrame) -> Finding:
         ],
         rows=[
             [
-                *(row["objects"], _CASES[row["case"]], f"{row[ERROR]:.3f}"),
+                *(row["objects"], CASES[row["case"]], f"{row[ERROR]:.3f}"),
                 f"{row['drives_departed']}/{row['drives']}",
             ]
             for row in records(kinds)
-            if row["case"] in _CASES
+            if row["case"] in CASES
         ],
         draw=lambda figure: draw_shares(
             figure, shares, "share of drives that leave the lane"
@@ -384,17 +251,6 @@ def _attacks(drives: pd.DataFrame) -> pd.DataFrame:
     return drives[(drives["environment"] == SURROGATE) & (drives["case"] == ATTACK)]
 
 
-def _name(place: Any) -> str:
-    """Return a short name of a scenario and its seed: the route and the seed."""
-    scenario, seed = place
-    return f"{str(scenario).split(',')[0]} {seed}"
-
-
 def _is_equal(frames: pd.Series, name: str) -> bool:
     """Whether a search rendered about as many frames as the gradient."""
     return bool(frames[name] >= EQUAL * frames[GRADIENT])
-
-
-def _by_place(drives: pd.DataFrame) -> pd.Series:
-    """Return the mean error by scenario and seed, metres."""
-    return drives.groupby(["scenario", "seed"], sort=False)[ERROR].mean()

@@ -10,8 +10,9 @@ import pytest
 from matplotlib.figure import Figure
 from support.pages.studies import drives, table
 
+from bench.studies.attack import is_farther, is_majority
 from bench.studies.charts import draw_heat, draw_ratios
-from bench.studies.findings import FINDINGS, finding, is_farther, is_majority
+from bench.studies.findings import FINDINGS, finding
 from bench.studies.fit_quality import fit_quality
 from bench.studies.pages import FOLDER, page_text, with_answer
 from bench.studies.plan import ROOT, read_plan, state

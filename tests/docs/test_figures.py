@@ -14,8 +14,8 @@ from support.pages.measured import page, results
 
 from bench.loop.bench import POLICIES, WAYS
 from bench.studies.findings import finding
-from bench.studies.light import light
 from bench.studies.plan import read_plan
+from bench.studies.vary import light
 from mi_nerfattack.experiment.sweep.table import read_table
 from mi_nerfattack.io import files
 
