@@ -100,6 +100,8 @@ class BenchResults:
         """Make the rows of a study that are missing; False if a command failed."""
         try:
             _make_inputs(study)
+            if study.grid is None:  # commands write files next to each other there
+                files.make_folder(study.work)
             try:
                 for words in self._words(study, take and study.take):
                     run_command(words)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -105,6 +106,21 @@ def test_a_run_takes_the_committed_rows_and_goes_on_after_a_failure(study, monke
         *3 * [[*sweep, "--take", str(study.folder)]],
         ["report", str(study.work), "-o", "page.md"],
     ]
+
+
+def test_commands_find_the_folder_that_they_write_in(study, monkeypatch):
+    other = {"grid": None, "cells": 1, "commands": ("fit x -o {work}/field",)}
+    fits = study.model_copy(update=other)
+    monkeypatch.setattr(run, "choose", lambda names: [fits])
+    calls = []
+
+    def write_field(words):
+        calls.append(words)
+        Path(words[-1]).write_text("")
+
+    monkeypatch.setattr(run, "run_command", write_field)
+    assert main(["results"]) == 0
+    assert calls == [["fit", "x", "-o", str(study.work / "field")]]
 
 
 def test_a_check_writes_the_differences_next_to_the_table(study, monkeypatch, capsys):
