@@ -280,9 +280,9 @@ def test_what_may_change_is_changed_by_force(
 ):
     observations, work = [], module.Job._attack
 
-    def watch(self, world, *arguments):
+    def watch(self, world, *arguments, **keywords):
         before = world.appearance()
-        attack = work(self, world, *arguments)
+        attack = work(self, world, *arguments, **keywords)
         observations.append((before, world.appearance(), attack))
         return attack
 

@@ -106,7 +106,7 @@ class Device:
 @pytest.fixture
 def device(monkeypatch):
     stand_in = Device()
-    monkeypatch.setattr(v4l, "_opened", lambda *_: stand_in)
+    monkeypatch.setattr(v4l, "_opened", lambda *_, driver: stand_in)
     monkeypatch.setattr(v4l, "time", SimpleNamespace(monotonic=lambda: 1000.0))
     yield stand_in
     stand_in.frames.put(None)

@@ -263,7 +263,7 @@ def test_a_calibration_from_beginning_to_end(tmp_path, monkeypatch, capsys):
     with StandIn(tmp_path / "log") as car:
         person = Person(car)
         monkeypatch.setattr("builtins.input", person)
-        monkeypatch.setattr(enable, "JoystickEnable", lambda *_: person)
+        monkeypatch.setattr(enable, "JoystickEnable", lambda *_, silence_s: person)
         arguments = ["car", "calibrate", car.port, "-o", str(output), "--speed-ms", "1"]
         arguments += ["--calibration", str(begin), "--wheelbase-m", str(WHEELBASE_M)]
         assert cli.main([*arguments, "--json"]) == 0

@@ -91,8 +91,8 @@ def test_no_two_draws_share_a_seed(field, monkeypatch):
         poses.append(drive_poses(routes, views, seed, mount).tobytes())
         return drive_poses(routes, views, 0, mount)
 
-    def keep(*arguments):
-        result = rays_of(*arguments)
+    def keep(*arguments, **keywords):
+        result = rays_of(*arguments, **keywords)
         jitter.append(result.jitter.numpy().tobytes())
         return result
 
