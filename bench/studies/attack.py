@@ -116,11 +116,10 @@ def country(drives: pd.DataFrame) -> Finding:
     made, deployed = attack(drives), drives["environment"] != SURROGATE
     out = drives[deployed & (drives["case"] == ATTACK)]["departed"]
     lane = f"and out of its lane in {out.sum()} of {len(out)} drives"
-    title = made.title.replace(" than the worst random texture", "").replace(
-        "T", "t", 1
-    )
     lane = lane if out.any() else "but never out of its lane"
-    return replace(made, title=f"On a country road, {title}, {lane}")
+    title = made.title.replace(" than the worst random texture", "")
+    title = f"On a country road, {title[0].lower()}{title[1:]}, {lane}"
+    return replace(made, title=title)
 
 
 def _threats_to_attack(
