@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 from support.pages.measured import page, results
 
+from bench.attack.drive import SECONDS
 from bench.loop.bench import POLICIES, WAYS
 from bench.studies.findings import finding
 from bench.studies.plan import read_plan
@@ -251,6 +252,8 @@ def test_the_table_of_attacks_equals_its_file():
     ):
         cells = " | ".join(f"{1e3 * row[f'{key}_seconds']:.0f}" for row in rows)
         assert f"| {name} | {cells} |" in text
+        ratios = " and ".join(f"{SECONDS / row[f'{key}_seconds']:.1f}" for row in rows)
+        assert f"{ratios} times" in words
 
 
 def test_the_table_of_the_loop_equals_its_file():
