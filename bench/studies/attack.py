@@ -13,6 +13,7 @@ from bench.studies.content import (
     ERROR,
     HALF,
     Finding,
+    deployment_of,
     ends_cell,
     interval_words,
     metres,
@@ -57,7 +58,7 @@ def is_majority(count: int, places: int) -> bool:
 
 def attack(drives: pd.DataFrame) -> Finding:
     """Compare the attack with the worst random texture of equal cost."""
-    where = next(name for name in drives["environment"].unique() if name != SURROGATE)
+    where = deployment_of(drives)
     own = drives[drives["environment"] == where]
     by_case = {case: own[own["case"] == case] for case in CASES}
     attacks, randoms = by_case[ATTACK], by_case[BEST_RANDOM]

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from mi_nerfattack.evaluation.summary import Interval
+from mi_nerfattack.evaluation.summary import Interval, interval
+from mi_nerfattack.scenario.deployment import SURROGATE
 
 HALF = 0.5  # of the error in the surrogate, and of the places
 #: Column of the mean distance from the lane centre.
@@ -45,6 +47,17 @@ def with_labels(drives: pd.DataFrame) -> pd.DataFrame:
     """
     fields = drives["attack"].str.split("-")
     return drives.assign(method=fields.str[-3], seed=fields.str[-2])
+
+
+def deployment_of(drives: pd.DataFrame) -> str:
+    """Return the first environment of drives that is not the surrogate."""
+    return next(name for name in drives["environment"].unique() if name != SURROGATE)
+
+
+def geometric_interval(logs: np.ndarray) -> Interval:
+    """Return the 95 % interval of a geometric mean from natural logarithms, (n,)."""
+    ends = interval(np.mean, (logs,), 0)
+    return None if ends is None else np.exp(ends).tolist()
 
 
 def ends_cell(ends: Interval, digits: int = 3) -> str:

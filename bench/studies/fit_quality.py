@@ -6,13 +6,19 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from bench.studies.charts import draw_ratios
-from bench.studies.content import ERROR, Finding, ends_cell, interval_words
+from bench.studies.content import (
+    ERROR,
+    Finding,
+    deployment_of,
+    ends_cell,
+    geometric_interval,
+    interval_words,
+)
 from bench.studies.plan import ROOT
-from mi_nerfattack.evaluation.summary import Interval, interval
+from mi_nerfattack.evaluation.summary import Interval
 from mi_nerfattack.io import files
 from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT
 from mi_nerfattack.scenario.deployment import SURROGATE
@@ -20,6 +26,11 @@ from mi_nerfattack.scenario.deployment import SURROGATE
 FIELDS = ROOT / "bench/fit_quality/fields"
 #: The method that attacks in the bundled field.
 BEST = "steps_12000"
+THREATS = (
+    "An interval that contains 1 does not show that two fields are equally good.",
+    "All fields are from the same 384 views with depth. A field from fewer views has "
+    "other faults.",
+)
 
 
 def fit_quality(
@@ -31,7 +42,7 @@ def fit_quality(
         drives: of the grid bench/fit_quality.toml; a method is a field.
         psnr: by method, dB; by default the mean over the routes of `FIELDS`.
     """
-    where = next(name for name in drives["environment"].unique() if name != SURROGATE)
+    where = deployment_of(drives)
     inside, deployed = (
         _errors(drives, environment, ATTACK) for environment in (SURROGATE, where)
     )
@@ -43,15 +54,6 @@ def fit_quality(
     ratios = {name: _mean(gains.loc[name]) for name in names if name != BEST}
     poor = [n for n, (_, ends) in ratios.items() if ends is not None and ends[1] < 1]
     worst = min(ratios, key=lambda name: psnr[name])
-    title = (
-        f"Attacks from {len(poor)} of {len(ratios)} poorer fields are weaker in the "
-        f"path-traced scene: {ratios[worst][0]:.2f} times at {psnr[worst]:.1f} dB"
-    )
-    if not poor:
-        title = (
-            "No poorer field is shown to make weaker attacks: at "
-            f"{psnr[worst]:.1f} dB, {ratios[worst][0]:.2f} times the error"
-        )
     rows = [
         [
             *(f"`{name}`", f"{psnr[name]:.1f}"),
@@ -64,7 +66,7 @@ def fit_quality(
     shares = ", ".join(f"{_mean(transfer.loc[n])[0]:.2f} (`{n}`)" for n in names)
     listed = ", ".join(f"`{name}`" for name in poor) or "none of them"
     return Finding(
-        title=title,
+        title=_title(len(poor), len(ratios), ratios[worst][0], psnr=psnr[worst]),
         sentences=(
             f"In the path-traced scene, attacks from `{worst}` have "
             f"{ratios[worst][0]:.2f} times the error of attacks from `{BEST}` "
@@ -86,12 +88,20 @@ def fit_quality(
         ),
         pandas="attacks = drives.query(\"case == 'attack'\")\n"
         'print(attacks.pivot_table("cross_track_mean_m", "method", "environment"))',
-        threats=(
-            "An interval that contains 1 does not show that two fields are equally "
-            "good.",
-            "All fields are from the same 384 views with depth. A field from fewer "
-            "views has other faults.",
-        ),
+        threats=THREATS,
+    )
+
+
+def _title(poor: int, fields: int, ratio: float, psnr: float) -> str:
+    """Return the title; `ratio` and `psnr` (dB) are those of the poorest field."""
+    if not poor:
+        return (
+            f"No poorer field is shown to make weaker attacks: at {psnr:.1f} dB, "
+            f"{ratio:.2f} times the error"
+        )
+    return (
+        f"Attacks from {poor} of {fields} poorer fields are weaker in the path-traced "
+        f"scene: {ratio:.2f} times at {psnr:.1f} dB"
     )
 
 
@@ -104,9 +114,7 @@ def _errors(drives: pd.DataFrame, environment: str, case: str) -> pd.DataFrame:
 def _mean(logs: Any) -> tuple[float, Interval]:
     """Return the geometric mean of the places that exist, and its interval."""
     known = logs.dropna().to_numpy()
-    ends = interval(np.mean, (known,), 0)
-    mean = math.exp(known.mean())
-    return mean, None if ends is None else np.exp(ends).tolist()
+    return math.exp(known.mean()), geometric_interval(known)
 
 
 def _cells(ratio: tuple[float, Interval] | None) -> list[str]:

@@ -5,12 +5,17 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from bench.studies.charts import draw_heat, draw_searches
-from bench.studies.content import ERROR, Finding, ends_cell, with_labels
-from mi_nerfattack.evaluation.summary import Interval, interval
+from bench.studies.content import (
+    ERROR,
+    Finding,
+    ends_cell,
+    geometric_interval,
+    with_labels,
+)
+from mi_nerfattack.evaluation.summary import Interval
 from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT
 from mi_nerfattack.scenario.deployment import SURROGATE
 
@@ -147,11 +152,7 @@ def _ends(log_shares: pd.DataFrame, method: str) -> dict[Where, Interval]:
 
 def _intervals(logs: Any) -> dict[Where, Interval]:
     """Return the interval of the geometric mean of each column."""
-    intervals: dict[Where, Interval] = {}
-    for place, logarithms in logs.items():
-        ends = interval(np.mean, (logarithms.to_numpy(),), 0)
-        intervals[place] = None if ends is None else np.exp(ends).tolist()
-    return intervals
+    return {place: geometric_interval(own.to_numpy()) for place, own in logs.items()}
 
 
 def vary_parts(drives: pd.DataFrame) -> Finding:

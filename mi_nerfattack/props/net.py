@@ -47,7 +47,7 @@ class Rectangle:
         width = min(self.right, other.right) - left
         height = min(self.top, other.top) - bottom
         good = width > 1e-6 and height > 1e-6
-        return Rectangle(left, bottom, width, height=height) if good else None
+        return Rectangle(left, bottom, width, height) if good else None
 
 
 @dataclass(frozen=True)
@@ -85,12 +85,12 @@ class Net:
     def __init__(self, edges_mm: np.ndarray, sheet: str | None = None) -> None:
         x, y, z = map(float, edges_mm)
         self.faces = {
-            "left": Rectangle(0, 0, y, height=z),
-            "front": Rectangle(y, 0, x, height=z),
-            "right": Rectangle(y + x, 0, y, height=z),
-            "back": Rectangle(2 * y + x, 0, x, height=z),
-            "top": Rectangle(y, z, x, height=y),
-            "bottom": Rectangle(y, -y, x, height=y),
+            "left": Rectangle(0, 0, y, z),
+            "front": Rectangle(y, 0, x, z),
+            "right": Rectangle(y + x, 0, y, z),
+            "back": Rectangle(2 * y + x, 0, x, z),
+            "top": Rectangle(y, z, x, y),
+            "bottom": Rectangle(y, -y, x, y),
         }
         self.tabs: list[Tab] = []
         self.folds: list[Line] = []

@@ -110,7 +110,7 @@ def _tiled(net: Net, width: float, height: float) -> Sheets | None:
         Tile(
             c,
             r,
-            Rectangle(left + c * step_x, top - r * step_y - high, across, height=high),
+            Rectangle(left + c * step_x, top - r * step_y - high, across, high),
         )
         for r in range(rows)
         for c in range(columns)
@@ -181,7 +181,7 @@ def _page(
     box: AttackedBox, net: Net, sheets: Sheets, tile: Tile, dpi: int, description: str
 ) -> Figure:
     part = tile.part
-    place = Rectangle(_MARGIN, _MARGIN + _FOOTER, part.width, height=part.height)
+    place = Rectangle(_MARGIN, _MARGIN + _FOOTER, part.width, part.height)
     figure, axes = _sheet(sheets, place, part)
     shown = []
     for face, rectangle in net.faces.items():
@@ -305,8 +305,8 @@ def _overview(box: AttackedBox, net: Net, sheets: Sheets, description: str) -> F
     height = max(p.top for p in rectangles) - bottom
     room = sheets.width - 2 * _MARGIN, sheets.height - 2 * _MARGIN - _FOOTER
     scale = min(room[0] / width, room[1] / height)
-    place = Rectangle(_MARGIN, _MARGIN + _FOOTER, scale * width, height=scale * height)
-    figure, axes = _sheet(sheets, place, Rectangle(left, bottom, width, height=height))
+    place = Rectangle(_MARGIN, _MARGIN + _FOOTER, scale * width, scale * height)
+    figure, axes = _sheet(sheets, place, Rectangle(left, bottom, width, height))
     for face, spot in net.faces.items():
         small = Image.fromarray(box.images[face]).resize(_THUMBNAIL_PX)
         extent = spot.left, spot.right, spot.bottom, spot.top
@@ -329,7 +329,7 @@ def _overview(box: AttackedBox, net: Net, sheets: Sheets, description: str) -> F
 
 
 def _last(sheets: Sheets) -> str:
-    return Tile(sheets.columns - 1, sheets.rows - 1, Rectangle(0, 0, 0, height=0)).name
+    return Tile(sheets.columns - 1, sheets.rows - 1, Rectangle(0, 0, 0, 0)).name
 
 
 def _line(
