@@ -43,8 +43,8 @@ class Retrain:
     older frames (--more), or lets --command train it. Then drives again. Only runs
     count whose scenario the expert itself can drive. Stopped, it continues from DATA.
     With more --held-out or --adaptive it continues without training again. Next to the
-    policy it writes NAME-retrain.json, with the errors before and after. Its own
-    training also writes program and record.
+    policy it writes NAME-retrain.json, with the errors before and after, and their
+    drives in NAME-retrain.csv. Its own training also writes program and record.
     """
 
     continues: ClassVar[bool] = True
@@ -108,10 +108,9 @@ class Retrain:
             BEFORE,
             OLD,
             Comparison,
-            table_rows,
+            write_comparison,
         )
         from mi_nerfattack.experiment.transfer.found import read_found
-        from mi_nerfattack.io import files
         from mi_nerfattack.report.table import card_table, retrain_table
         from mi_nerfattack.system.workers import chosen_workers
         from mi_nerfattack.training.dataset import find_shards
@@ -156,8 +155,7 @@ class Retrain:
                 drives, before, after, policy=setting, workers=workers, bars=bars
             )
         document = _describe(policy.content, groups, anew, others=others) | trained
-        document["table"] = table_rows(before, after)
-        files.write_json(comparison_path, document)
+        write_comparison(comparison_path, document, before, after)
 
         def show() -> None:
             tables = [card_table(card)] if card else []
@@ -186,13 +184,14 @@ class Retrain:
         from mi_nerfattack.io import files
         from mi_nerfattack.policy.exported import SUFFIX
 
-        beside = [self.output.with_name(f"{self.output.stem}-retrain.json")]
+        comparison = self.output.with_name(f"{self.output.stem}-retrain.json")
+        written = [self.output, comparison, comparison.with_suffix(".csv")]
         if training is None:
             check_output(self.output)
-            beside = [*map(self.output.with_suffix, (SUFFIX, ".json")), *beside]
-        for path in (self.output, *beside):
+            written += map(self.output.with_suffix, (SUFFIX, ".json"))
+        for path in written:
             files.check_writable(path)
-        return beside[-1]
+        return comparison
 
     def _policy(
         self, attacks: Sequence[FoundAttack], training: AbstractUserTraining | None

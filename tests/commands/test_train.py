@@ -21,7 +21,9 @@ from mi_nerfattack.commands.retrain import Retrain
 from mi_nerfattack.commands.shared.policy_file import PolicyFile
 from mi_nerfattack.commands.train import Train
 from mi_nerfattack.deploy.place import bundled_place
+from mi_nerfattack.drives.table import TEXT, read_csv
 from mi_nerfattack.experiment.retrain.solvable import drive_expert
+from mi_nerfattack.experiment.transfer.figures import TABLE
 from mi_nerfattack.experiment.transfer.found import read_found
 from mi_nerfattack.io import files
 from mi_nerfattack.policy.pilotnet import PilotNet
@@ -130,6 +132,10 @@ def check_table(document: dict, folder: Path, *extra_groups: str) -> None:
     """Before and after are the drives of a transfer of each group by each policy."""
     rows = document["table"]
     assert [row["group"] for row in rows] == ["old", "held_out", *extra_groups]
+    types = {"group": TEXT, "policy": TEXT} | TABLE
+    drives = read_csv(folder / "new-retrain.csv", types)
+    drives = drives.set_index(["group", "policy", "case"])["cross_track_mean_m"]
+    assert len(drives) == 4 * len(rows)  # two policies, two cases, one start
     assert [item["label"] for item in document["held_out"]] == ["run"]
     for row in rows:
         for stage in ("before", "after"):
@@ -144,6 +150,8 @@ def check_table(document: dict, folder: Path, *extra_groups: str) -> None:
                 for case in ("no_object", "attack")
             )
             assert row["attack_to_clean"][stage] == pytest.approx(attacked / clean)
+            assert drives[row["group"], stage, "attack"] == attacked
+            assert drives[row["group"], stage, "no_object"] == clean
         before, after = (row[s]["no_object"] for s in ("before", "after"))
         assert before["cross_track_mean_m"] != after["cross_track_mean_m"]
         ratio = after["cross_track_mean_m"] / before["cross_track_mean_m"]

@@ -194,7 +194,7 @@ JOBS = {
         "-o new.safetensors --data data --epochs 1 --card-runs 1 --runs 1 "
         "--frames surrogate 64 --exposures-ev 0 --environments surrogate",
         "pilotnet",
-        ("new.safetensors", "new-retrain.json"),
+        ("new.safetensors", "new-retrain.csv", "new-retrain.json"),
         "data/**/shard_*",
         "data/old_before",
         ("lock",),
@@ -207,7 +207,7 @@ JOBS = {
         "-o new.safetensors --data data --module mine.py:train --trust-code --runs 1 "
         "--frames surrogate 64 --exposures-ev 0 --environments surrogate",
         "module",
-        ("new.safetensors", "new-retrain.json"),
+        ("new.safetensors", "new-retrain.csv", "new-retrain.json"),
         "data/**/shard_*",
         "data/old_before",
         ("lock",),

@@ -10,16 +10,7 @@ from typing import Any
 import pandas as pd
 from scipy.stats import gmean
 
-from mi_nerfattack.drives.table import (
-    INTEGER,
-    MAX_BYTES,
-    NUMBER,
-    TEXT,
-    TRUTH,
-    read_csv,
-    records,
-    write_csv,
-)
+from mi_nerfattack.drives.table import MAX_BYTES, read_csv, records, write_csv
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.summary import summary
 from mi_nerfattack.experiment.sweep.cell import CELLS
@@ -38,8 +29,10 @@ from mi_nerfattack.experiment.sweep.table import (
 from mi_nerfattack.experiment.transfer.columns import ENVIRONMENTS
 from mi_nerfattack.experiment.transfer.figures import (
     DOCUMENT,
+    TABLE,
     column_figures,
     compare_rows,
+    drives_of,
     read_document,
 )
 from mi_nerfattack.io import files
@@ -56,14 +49,6 @@ CASES = {
     RANDOM: "random textures",
     ATTACK: "attack",
 }
-#: Columns of the table, one row per drive.
-TABLE = {
-    **dict.fromkeys(("attack", "environment", "condition", "case", "route"), TEXT),
-    "run": INTEGER,
-    **dict.fromkeys(("cross_track_mean_m", "cross_track_max_m", "wheel_out_s"), NUMBER),
-    "departed": TRUTH,
-}
-
 Figures = Mapping[str, Any]
 _SEED = 1  # of intervals
 
@@ -286,19 +271,6 @@ def _provenance(summary: Figures, made: Figures) -> str:
         *((key, f"SHA-256 {digest}") for digest, key in contents.items()),
     ]
     return f"## What it was made of\n\n{markdown_table(['what', 'which'], rows)}"
-
-
-def drives_of(document: Mapping[str, Any]) -> pd.DataFrame:
-    """Return the drives of a ``transfer.json`` with `TABLE`'s columns."""
-    routes = {item["label"]: item["route"] for item in document["attacks"]}
-    rows = [
-        {**row, "case": case, "route": routes[row["attack"]], **run}
-        | {"departed": run["steps_departed"] > 0}
-        for row in document["rows"]
-        for case, figures in row["cases"].items()
-        for run in figures["per_run"]
-    ]
-    return pd.DataFrame(rows, columns=list(TABLE)).astype(TABLE)
 
 
 def transfer_sections(drives: pd.DataFrame) -> Iterator[str]:

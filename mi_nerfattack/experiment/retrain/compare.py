@@ -7,12 +7,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from mi_nerfattack.drives.store import Store
+from mi_nerfattack.drives.table import write_csv
 from mi_nerfattack.experiment.run_folder import SCENARIO
 from mi_nerfattack.experiment.transfer.columns import make_columns
-from mi_nerfattack.experiment.transfer.figures import DRIVES, check_output, run_transfer
+from mi_nerfattack.experiment.transfer.figures import (
+    DRIVES,
+    check_output,
+    drives_of,
+    run_transfer,
+)
 from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.experiment.transfer.work import TransferDrives
+from mi_nerfattack.io import files
 from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT
 from mi_nerfattack.scenario.scenario import Scenario, load_scenario
 from mi_nerfattack.system.workers import AbstractWorkers
@@ -24,6 +33,8 @@ _SEED = 1
 
 #: Called with control periods done and wanted.
 OnSteps = Callable[[int, int], None]
+#: `transfer.json` by group.
+Documents = Mapping[str, Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -108,14 +119,37 @@ def read_with_policy(attack: FoundAttack, policy: str) -> tuple[Scenario, str]:
     return load_scenario(attack.folder / SCENARIO, settings=(policy,))
 
 
-def table_rows(
-    before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping[str, Any]]
-) -> list[dict[str, Any]]:
+def write_comparison(
+    path: Path, document: dict[str, Any], before: Documents, after: Documents
+) -> None:
+    """Write the result of a retraining, and the drives behind its table.
+
+    Args:
+        path: of the result, ``NAME-retrain.json``. The drives are written to
+            ``NAME-retrain.csv``, one row each: `group`, `policy` (`BEFORE` or `AFTER`)
+            and the columns of `transfer.figures.TABLE`.
+        document: other keys of the result; gets `table`, see :func:`table_rows`.
+        before: of the drives before the retraining.
+        after: of the drives after the retraining.
+    """
+    document["table"] = table_rows(before, after)
+    tables = []
+    for policy, documents in ((BEFORE, before), (AFTER, after)):
+        for group, of_group in documents.items():
+            drives = drives_of(of_group)
+            drives.insert(0, "group", group)
+            drives.insert(1, "policy", policy)
+            tables.append(drives)
+    write_csv(path.with_suffix(".csv"), pd.concat(tables))
+    files.write_json(path, document)
+
+
+def table_rows(before: Documents, after: Documents) -> list[dict[str, Any]]:
     """Write both stages into one table.
 
     Args:
-        before: `transfer.json` by group, of the drives before the retraining.
-        after: `transfer.json` by group, of the drives after the retraining.
+        before: of the drives before the retraining.
+        after: of the drives after the retraining.
 
     Returns:
         one row per group and environment: figures by stage and case, as in the columns

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from mi_nerfattack.drives.run import Groups, OnSteps, run_drives
-from mi_nerfattack.drives.table import records
+from mi_nerfattack.drives.table import INTEGER, NUMBER, TEXT, TRUTH, records
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.metrics import summarise
 from mi_nerfattack.evaluation.summary import DEPARTED_S, share_interval, summary
@@ -24,6 +24,13 @@ from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.system.workers import AbstractWorkers
 
 SCHEMA = 1
+#: Columns of :func:`drives_of`, one row per drive.
+TABLE = {
+    **dict.fromkeys(("attack", "environment", "condition", "case", "route"), TEXT),
+    "run": INTEGER,
+    **dict.fromkeys(("cross_track_mean_m", "cross_track_max_m", "wheel_out_s"), NUMBER),
+    "departed": TRUTH,
+}
 
 #: Figures of a case by the digest of its batch.
 Figures = Mapping[str, dict[str, Any]]
@@ -176,6 +183,14 @@ def column_figures(
             }
         )
     return columns
+
+
+def drives_of(document: Mapping[str, Any]) -> pd.DataFrame:
+    """Return the drives of a whole ``transfer.json`` with `TABLE`'s columns."""
+    routes = {item["label"]: item["route"] for item in document["attacks"]}
+    drives = _drives(document["rows"])
+    drives["route"] = drives["attack"].map(routes)
+    return drives[list(TABLE)].astype(TABLE)
 
 
 def _drives(rows: Sequence[Row]) -> pd.DataFrame:

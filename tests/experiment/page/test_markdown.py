@@ -22,6 +22,7 @@ from mi_nerfattack.experiment.sweep.table import (
     read_table,
 )
 from mi_nerfattack.experiment.transfer.columns import ENVIRONMENTS, make_columns
+from mi_nerfattack.experiment.transfer.figures import TABLE
 from mi_nerfattack.io import files
 
 ROOT = Path(__file__).parents[3]
@@ -84,7 +85,7 @@ def test_a_transfer_leaves_a_table_of_which_its_page_is_written_again(tmp_path):
     page = tmp_path / "page" / "README.md"
     page.parent.mkdir()
     assert cli.main(["report", str(tmp_path), "-o", str(page)]) == 0
-    table = read_csv(page.with_name(markdown.DRIVES), markdown.TABLE)
+    table = read_csv(page.with_name(markdown.DRIVES), TABLE)
     assert len(table) == 99 * 2 and set(table["cross_track_mean_m"]) == {0.4}
     text = page.read_text()
     assert cli.main(["report", str(page.parent), "-o", str(page)]) == 0
