@@ -43,6 +43,7 @@ from mi_nerfattack.rollout.drive import ATTACK, RANDOM
 from mi_nerfattack.scenario.deployment import SURROGATE
 
 _BY_GRADIENT = ("attached", "open_loop", "single_frame")
+FLAT_PLACES, FLAT_AIM = 30, 0.6  # of bench/flat.toml: places, share of drives
 EQUAL = 0.8  # of the gradient's frames, from which on a search has an equal budget
 
 _OF_SEARCHES = (
@@ -102,8 +103,8 @@ def gradient(drives: pd.DataFrame) -> Finding:
         sentences=(
             f"Over {nearest.attacks} places, the gradient moves the car "
             f"{nearest.one:.2f} m from the lane centre on average in the surrogate, "
-            f"and is farther than {also} of {len(others)} other searches that use a "
-            f"gradient ({', '.join(f'`{name}`' for name in others)}).",
+            f"and is farther than {also} of {len(others)} other searches by gradient "
+            f"at equal cost ({', '.join(f'`{name}`' for name in others)}).",
             f"The closest other search is `{close}`: the gradient moves the car "
             f"{nearest.ratio:.2f} times as far "
             f"({interval_words(nearest.ratio_ci95, 2)}).",
@@ -140,7 +141,17 @@ def _threats_to_gradient(
                 f"`{name}` cost {frames[name]:.0f} frames and the gradient "
                 f"{frames[GRADIENT]:.0f}, so the title does not count this search."
             )
-    places = own.groupby(["scenario", "seed", "method"])[ERROR].mean().unstack()
+    by = ["scenario", "seed", "method"]
+    costs = own.groupby(by)["frames"].mean().unstack()
+    for name in fair:
+        cheap = costs[name] < EQUAL * costs[GRADIENT]
+        if cheap.any():
+            yield (
+                f"`{name}` has an equal cost on average only: at {cheap.sum()} of "
+                f"{len(costs)} places, it rendered less than {EQUAL} times the frames "
+                "of the gradient."
+            )
+    places = own.groupby(by)[ERROR].mean().unstack()
     behind = places[places[GRADIENT] < places[fair].max(axis=1)]
     for place, errors in behind.iterrows():
         error = errors[GRADIENT]
@@ -161,17 +172,18 @@ def searches(drives: pd.DataFrame) -> Finding:
     rank = errors.dropna().map(math.log).mean(axis=1).map(math.exp)
     best = str(rank.idxmax())
     title = "Not yet known which search by gradient is best: one place per route"
-    spread = own.groupby("cell")[ERROR].std().mean()
+    spread = own.groupby("cell")[ERROR].std()
     return Finding(
         title=title,
         sentences=(
-            f"Of the {len(rank)} searches with an attack on each of these routes, "
+            f"Of the {len(rank)} searches with an attack on each route of the table, "
             f"`{best}` has the largest geometric mean of the error in the surrogate, "
             f"{rank.max():.2f} m.",
             "There is one place per route, so the table has no intervals and the order "
             "is uncertain.",
-            "Between the starts of one attack, the error has a standard deviation of "
-            f"{spread:.3f} m on average.",
+            "Between the drives of one attack, the error has a standard deviation of "
+            f"{spread.mean():.3f} m on average, and of {spread.median():.3f} m in the "
+            "median.",
         ),
         head=["search", *(f"{route}, surrogate (m)" for route in errors.columns)],
         rows=[
@@ -194,6 +206,9 @@ def flat(drives: pd.DataFrame) -> Finding:
     places = own[own["case"] == ATTACK].groupby("cell")["departed"].any()
     out, all_places = int(places.sum()), len(places)
     ends = share_interval(out, all_places)
+    missing = 2 * (FLAT_PLACES - all_places)  # two drives at each
+    most = (left[ATTACK] + missing) / (count[ATTACK] + missing)
+    lost = f" At most {100 * most:.0f} % are possible now, so we missed this aim."
     percent = f"{100 * shares[CASES[ATTACK]]:.0f} %"
     title = f"Flat objects send the car out of its lane in {percent} of the drives"
     kinds = summary(own, ["objects", "case"], ["cell"])
@@ -202,12 +217,13 @@ def flat(drives: pd.DataFrame) -> Finding:
         sentences=(
             f"With the attack, {left[ATTACK]} of {count[ATTACK]} drives leave the lane "
             "in the path-traced scene, where its sun and sky light the object. "
-            f"These drives are at {out} of {all_places} places (share: "
+            f"They are at {out} of {all_places} places (share of the places: "
             f"{interval_words(ends, 2)}).",
             f"With random textures, {left[RANDOM]} of {count[RANDOM]} drives leave the "
             "lane.",
             "The aim that we set before the first result is 60 % of the drives with "
-            "the attack, and none with random textures.",
+            "the attack, and none with random textures."
+            + (lost if most < FLAT_AIM else ""),
         ),
         head=[
             "object",
@@ -228,7 +244,31 @@ def flat(drives: pd.DataFrame) -> Finding:
         ),
         pandas='lit = drives[drives.environment == "built_in"]\n'
         'print(lit.groupby(["objects", "case"]).departed.mean())',
+        threats=(_by_environment(drives), _routes(own)),
     )
+
+
+def _by_environment(drives: pd.DataFrame) -> str:
+    """Say in which environment flat objects lose their effect."""
+    attacks = drives[drives["case"] == ATTACK].groupby("environment", sort=False)
+    left, means = attacks["departed"].agg(["sum", "size"]), attacks[ERROR].mean()
+    counts = ", ".join(
+        f"`{name}` {count} of {n} ({means[name]:.2f} m)"
+        for name, count, n in left.itertuples()
+    )
+    return (
+        "Drives with the attack that leave the lane, and the mean error, by "
+        f"environment: {counts}."
+    )
+
+
+def _routes(own: pd.DataFrame) -> str:
+    """Say how many places of each kind and route the rows have."""
+    places = own.groupby(["objects", "route"], sort=False)["cell"].nunique()
+    counts = ", ".join(
+        f"{kind} on `{route}` {count}" for (kind, route), count in places.items()
+    )
+    return f"The places so far: {counts}. Other routes may give other shares."
 
 
 #: By the name of the page: what is not known while attacks are missing, and the rest.

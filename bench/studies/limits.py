@@ -42,8 +42,8 @@ def limits(places: pd.DataFrame) -> Finding:
         for kind, own in rows.groupby("objects", sort=False)
     ]
     return Finding(
-        title=f"Objects can take the car off the lane at {rows['out'].sum():.0f} of "
-        f"{len(rows)} places",
+        title="With a picture of its own in each frame, objects take the car off the "
+        f"lane at {rows['out'].sum():.0f} of {len(rows)} places",
         sentences=(
             "The reach is the largest change of the control that the pixels of the "
             "objects can cause, in rad/s. If each pixel takes its worst value in each "

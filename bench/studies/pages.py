@@ -12,7 +12,7 @@ from pathlib import Path
 from PIL import Image
 
 from bench.studies.findings import Finding, finding
-from bench.studies.plan import ROOT, UNKNOWN, State, Study, read_plan, state
+from bench.studies.plan import ROOT, UNKNOWN, State, Study, choose, read_plan, state
 from bench.tables import markdown
 from mi_nerfattack.io import files
 from mi_nerfattack.report.plots.charts import blank, png
@@ -87,11 +87,18 @@ def page_text(study: Study, made: Finding, one: State, picture: str) -> str:
         one: how far the study is.
         picture: address of the chart.
     """
-    data, rule = f"{study.table}/{study.rows}", study.grid or "bench/results.toml"
+    data, names = f"{study.table}/{study.rows}", [*study.reads, study.name]
+    rules = [one.grid for one in choose(tuple(names)) if one.grid is not None]
+    listed = " and ".join(
+        f"[`{Path(rule).name}`]({relpath(ROOT / rule, FOLDER)})"
+        for rule in rules or ["bench/results.toml"]
+    )
+    what = "places, seeds and budgets" if rules else "commands"
+    only = names[0] if len(names) == 1 else f'"{" ".join(names)}"'
     threats = [f"The table has {one.done} of {one.wanted} {study.units}."]
     if UNKNOWN in one.sources:
         threats.append(
-            "Nobody recorded which version of the source made these rows, so today's "
+            "Nobody recorded which commit of the source made these rows, so today's "
             f"program may give other figures (`make results LIST=1 ONLY={study.name}`)."
         )
     if len(one.sources) > 1:
@@ -99,8 +106,8 @@ def page_text(study: Study, made: Finding, one: State, picture: str) -> str:
     threats += [*made.threats, *study.threats]
     description = (
         f"[`{data}`]({relpath(ROOT / data, FOLDER)}) has the rows. "
-        f"[`{Path(rule).name}`]({relpath(ROOT / rule, FOLDER)}) has the places, seeds "
-        f"and budgets. `make results ONLY={study.name}` makes missing rows. "
+        f"{listed} {'has' if len(rules) < 2 else 'have'} the {what}. "
+        f"`make results ONLY={only}` makes missing rows. "
         f"{study.note} [How to read this page](index.md)."
     )
     code = f'import pandas as pd\n\ndrives = pd.read_csv("{data}")\n{made.pandas}'

@@ -62,6 +62,7 @@ class Study(Section):
     core_hours: Positive  # of one unit
     basis: str  # how we know core_hours
     inputs: tuple[str, ...] = ()  # files of [[inputs]]
+    reads: tuple[str, ...] = ()  # names of studies whose runs the commands read
     report: str | None = None  # command that writes the figures of a page
     pages: tuple[str, ...] = ()  # that quote the table
     finding: str | None = None  # name of the page in docs/results/findings

@@ -112,8 +112,9 @@ def test_transfer_counts_places_not_attacks():
     rows = [
         {"attack": f"left-{name}-{seed}-0", "environment": where, "condition": "day"}
         | {"route": "left", "case": case, "cross_track_mean_m": error * (1 + seed)}
+        | {"departed": where == "kept"}
         for where, factor in (("surrogate", 1.0), ("kept", 0.8), ("lost", 0.2))
-        for seed in range(5)
+        for seed in range(6)
         for name, change in (("one", 2), ("two", 0.5))
         for case, error in (
             ("attack", factor * (change + seed / 1e4 if factor < 1 else 1)),
@@ -122,11 +123,25 @@ def test_transfer_counts_places_not_attacks():
     ]
     answer = made("transfer", pd.DataFrame(rows))
     assert "in 1 of 2 environments, under half in 1" in answer.title
-    assert "5 places with 10 attacks" in answer.sentences[2]
+    assert "6 places with 12 attacks" in answer.sentences[2]
+    assert "0.20 to 0.80 for pasted objects." in answer.sentences[0]
+    assert "`surrogate` 0, `kept` 12, `lost` 0" in answer.threats[1]
+    assert len(answer.threats) == 2
     assert answer.rows == [
         ["kept", "0.80", "0.80 to 0.80", "0.10"],
         ["lost", "0.20", "0.20 to 0.20", "0.10"],
     ]
+
+    # without one of six places, which lost all, the others would count
+    table = pd.DataFrame(rows)
+    lost = table["attack"].str.endswith("-4-0") & (table["environment"] == "kept")
+    table.loc[lost, "cross_track_mean_m"] = 1e-9
+    answer = made("transfer", table)
+    assert "in 0 of 2 environments" in answer.title
+    (threat,) = answer.threats[2:]
+    assert "without left 4, the attacks keep over half in 1 of 2" in threat
+    five = table[~table["attack"].str.contains("-5-")]  # four have no interval
+    assert not made("transfer", five).threats[2:]
 
 
 def light_rows(methods, where):
@@ -148,8 +163,13 @@ def test_light_counts_aims_and_where_varying_helps():
     where |= {("mujoco_built_in", "day"): 0.72, ("mitsuba", "evening"): 0.59}
     rows = light_rows({"plain": 1.0, "vary": 2.0}, where)
     answer = made("light", rows)
-    assert "helps attacks in 3 of 3" in answer.title and "aim in 1" in answer.title
-    assert answer.sentences[1].endswith("`plain` reaches the aim in 1 rows.")
+    assert "helps attacks in 3 of 3" in answer.title
+    assert answer.title.endswith("It reaches 1 aims, and `plain` 1")
+    assert "`plain` reaches the aim in 1 rows." in answer.sentences[1]
+    assert "in 1 rows with `vary` and in 1 with" in answer.sentences[1]
+    assert (
+        "`vary` moves the car farther in `surrogate` day (5 of 5" in answer.threats[3]
+    )
     assert "5 attacks with `vary` and 5 attacks with `plain`" in answer.sentences[0]
     missed = "misses it in `mitsuba` day, `mitsuba` evening."
     assert missed in answer.sentences[1] and "in 1 of 3 rows" in answer.sentences[1]
@@ -164,7 +184,7 @@ def test_light_counts_aims_and_where_varying_helps():
     assert {row[7] for row in answer.rows} == {"2.00 to 2.01"}
     threat = answer.threats[-1]
     assert "leaves the lane at 2 places" in threat and "lane at 2 of them" in threat
-    assert threat.endswith("The attacks at the other 3 places keep 0.72 there.")
+    assert "The attacks at the other 3 places keep 0.72 there" in threat
     alone = made("light", rows[rows["attack"].str.contains("vary")])
     assert "helps attacks in 0 of 3" in alone.title
     assert "0 attacks with `plain`" in alone.sentences[0]
