@@ -254,13 +254,17 @@ class GradientAttack(AbstractAttack):
     def _values(self, gradient: Gradient) -> Parameters:
         """Return the gradient by the optimiser's keys, checked."""
         colours = self._colours()
-        values = {
-            key: colouring.gradient(colours[key], gradient.textures[int(key)].numpy())
-            for key, colouring in self._colourings.items()
-        }
+        values = {}
+        for key, colouring in self._colourings.items():
+            by_texture, row = gradient.textures[int(key)].numpy(), int(key)
+            values[key] = colouring.gradient(colours[key], by_texture)
+            if not self._depended[row]:  # a penalty does not count
+                alone = colouring.gradient(colours[key], np.zeros_like(by_texture))
+                self._depended[row] = (values[key] != alone).any()
         if self.freedom.pose_rate is not None:
             by_offsets = offset_gradients(self.sensor, gradient)
             values[OFFSETS] = by_offsets * self.freedom.mask
+            self._depended |= values[OFFSETS].any(axis=1)
         values = {key: values[key] for key in self.optimiser}
         for key, value in values.items():
             if not np.isfinite(value).all():
@@ -273,11 +277,6 @@ class GradientAttack(AbstractAttack):
 
     def _update(self, gradients: Parameters) -> float:
         """Step; return the gain that the gradients predict."""
-        for key, value in gradients.items():  # objects that the cost depends on
-            if key == OFFSETS:
-                self._depended |= value.any(axis=1)
-            else:
-                self._depended[int(key)] |= value.any()
         before = {key: self._value(key) for key in gradients}  # to predict the gain
         scale = self.plan.gradient_scale(list(gradients.values()))
         values = {

@@ -212,7 +212,8 @@ class SceneCamera:
         if key not in self._rows:
             suns = self.variation.suns(self.first, count)
             assert isinstance(item.light_maps, LightMaps)
-            rows = mi.UInt32(item.light_maps.rows(suns, item.placed.rotation))
+            # An attack that turns the object turns its light, too
+            rows = mi.UInt32(item.light_maps.rows(suns, item.pose.rotation))
             dr.make_opaque(rows)
             self._rows[key] = rows
         return Gain(colour, dr.gather(mi.UInt32, self._rows[key], drive))

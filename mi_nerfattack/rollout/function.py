@@ -122,6 +122,9 @@ class Rollout:
         Args:
             initial: (m, n) from :meth:`ClosedLoop.initial`.
             on_step: called after each control period with its index.
+
+        Raises:
+            InputError: the objective is not finite.
         """
 
         def keep(step: Step) -> Any:
@@ -135,6 +138,9 @@ class Rollout:
         Args:
             initial: (m, n) from :meth:`ClosedLoop.initial`.
             on_step: called after each control period with its index.
+
+        Raises:
+            InputError: the objective is not finite.
         """
         return self._evaluate(initial, on_step, None)
 
@@ -153,6 +159,10 @@ class Rollout:
             camera_path=self.camera_path,
         )
         value, costs = Cost(self.objective, self.reduction).of(drive)
+        if not np.isfinite(value):
+            raise InputError(
+                f"objective: {value}; check policy, vehicle and costs for NaN"
+            )
         return Evaluation(value, costs, drive)
 
     def gradient(
@@ -189,7 +199,15 @@ class Rollout:
             drive: through the loop; `tape` is the policy's memory before each period,
                 as :class:`Replay` keeps it.
             steps: control periods.
+
+        Raises:
+            InputError: the drive has no such memory.
         """
+        if not isinstance(self.adjoint, Replay) or len(drive.tape) < drive.horizon:
+            raise InputError(
+                "drive: derivatives by images need the policy's memory of each period; "
+                "take a drive of run(), of a Rollout with adjoint=Replay()"
+            )
         d_states = Cost(self.objective, self.reduction).by_states(drive)
         return backward_to_images(
             self.loop, drive, d_states, steps=steps, attached=self.attached

@@ -128,10 +128,11 @@ class SceneSensor(AbstractDifferentiableSensor):
         `LightMaps` get some, made of their field.
 
         Raises:
-            InputError: light on objects, and there are none.
+            InputError: light on objects, and a `field_integrator` shows none.
         """
         objects = {id(posed): posed for posed in self.objects}
-        if variation.of_light and not objects:
+        layers = {id(layer) for layer in self.layers}
+        if variation.of_light and not (objects and objects.keys() <= layers):
             raise InputError(
                 "light: there are no objects whose light could vary; show grid fields "
                 "by a field_integrator, and select their colours"

@@ -87,7 +87,7 @@ class StepRecorder:
         if self.on_period is not None:
             self.on_period(index, gradients)
         norms = [float(np.linalg.norm(gradient)) for gradient in gradients]
-        pairs = zip(gradients, self.directions, strict=False)
+        pairs = zip(gradients, self.directions, strict=bool(self.directions))
         self._rows.append((norms, [float(a @ b) for a, b in pairs]))
 
     def result(self) -> Attribution:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 
 import mitsuba as mi
 import numpy as np
@@ -19,7 +20,10 @@ from mi_nerfattack.attack.objectives import (
     HeadingDeviation,
     TargetDistance,
 )
+from mi_nerfattack.attack.texture.colours import Colours
+from mi_nerfattack.attack.texture.constraints import Constraints
 from mi_nerfattack.attack.user_cost import UserCost
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.posed import move_all
 from mi_nerfattack.rollout.function import Rollout
@@ -118,11 +122,26 @@ def test_the_curve_keeps_the_first_of_the_best():
     ]
 
 
-def test_what_has_no_gradient_is_told(loop):
-    """By a policy that looks at nothing, also after the attack was resumed."""
+def test_an_objective_that_is_no_number_is_refused(loop):
+    with attack_of(loop, "absolute") as attack:
+        undefined = StageSum(lambda state: state[0] * np.nan)
+        attack.rollout = replace(attack.rollout, objective=undefined)
+        with pytest.raises(InputError, match="objective: nan"):
+            attack.step()
+        assert not attack.history and attack.best_objective == np.inf
+
+
+@pytest.mark.parametrize("total_variation", [0.0, 0.1])
+def test_what_has_no_gradient_is_told(loop, total_variation):
+    """By a policy that looks at nothing, also after the attack was resumed.
+
+    A penalty of the colours has a gradient, and says nothing about the policy.
+    """
     blind = toy.SmoothPolicy()
     blind.weight.data.zero_()
-    options = {"horizon": 3, "freedom": Freedom(0.3, 0.02)}
+    constraints = Constraints(total_variation=total_variation)
+    colouring = partial(Colours, constraints=constraints)
+    options = {"horizon": 3, "freedom": Freedom(0.3, 0.02, colouring=colouring)}
     for policy, expected in ((None, []), (TorchPolicy(blind), [0])):
         with attack_of(loop, "absolute", policy=policy, **options) as attack:
             assert attack.without_gradient == []  # nothing is known yet

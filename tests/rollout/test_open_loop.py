@@ -17,6 +17,7 @@ from mi_nerfattack.attack.plan import Plan, Schedule
 from mi_nerfattack.attack.texture.colours import Colours
 from mi_nerfattack.attack.texture.constraints import Constraints
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.rollout.adjoint import KeptBackgrounds
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.objective import StageSum
 from mi_nerfattack.rollout.sweep import StepRecorder
@@ -176,10 +177,14 @@ def test_what_makes_no_sense_is_refused(closed):
     rollout, initial, _ = closed
     attached = replace(rollout.open_loop(initial), attached=True)
     evaluation = attached.run(initial)
+    kept = replace(rollout, adjoint=KeptBackgrounds())
+    measured = rollout.measure(initial).trajectory
     for call, message in (
         (lambda: rollout.open_loop(initial, HORIZON), "frame: 6; .* 6"),
         (lambda: attached.gradient(evaluation), "attached to false"),
         (lambda: attached.by_images(evaluation.trajectory, {1}), "attached to false"),
+        (lambda: kept.by_images(kept.run(initial).trajectory, {1}), r"=Replay\(\)"),
+        (lambda: rollout.by_images(measured, {1}), r"a drive of run\(\)"),
     ):
         with pytest.raises(InputError, match=message):
             call()

@@ -242,6 +242,18 @@ def test_a_varied_drive_is_the_same_in_any_batch_and_from_run_to_run():
     assert abs(other - batch[..., :3]).max() > 0.05
 
 
+def test_the_light_turns_with_an_object_that_an_attack_turns():
+    """The order of moves decides nothing: no map is of the first pose that was seen."""
+    loop, plain = varied(Variation(sun=SunRanges(), seed=1))
+    state, (posed,) = loop.initial(POSES), plain.objects
+    before = loop.sensor.observe(state, 0).linear.numpy()
+    posed.move(np.array([0, 0, 0, 0, 0, 0.4]))
+    turned = loop.sensor.observe(state, 0).linear.numpy()
+    assert abs(turned - before).max() > 0.01
+    other = plain.varied(Variation(sun=SunRanges(), seed=1))
+    np.testing.assert_array_equal(other.observe(state, 0).linear.numpy(), turned)
+
+
 @pytest.mark.parametrize("adjoint", toy.ADJOINTS)
 def test_gradients_are_those_of_the_varied_drives(adjoint):
     """Attached, so that light, mount and vehicle are all in the derivative."""

@@ -154,9 +154,11 @@ class Colours(AbstractColouring):
         """See :meth:`AbstractColouring.near`."""
         # All levels add up to a colour, so the field takes the texture for a moment
         before = self._field.texture.numpy().copy()
-        self._field.set_parameter("texture", texture)
-        colours = vertex_colours(self._field, self.level)
-        self._field.set_parameter("texture", before)
+        try:
+            self._field.set_parameter("texture", texture)
+            colours = vertex_colours(self._field, self.level)
+        finally:
+            self._field.set_parameter("texture", before)
         return self.project(np.clip(colours, 1e-4, 1 - 1e-4))
 
     def project(self, value: np.ndarray) -> np.ndarray:
