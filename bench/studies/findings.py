@@ -30,6 +30,7 @@ from bench.studies.content import (
 from bench.studies.fit_quality import fit_quality
 from bench.studies.limits import limits
 from bench.studies.plan import Study, state
+from bench.studies.repaired import repaired
 from bench.studies.transfer import transfer
 from bench.studies.vary import light, vary_parts
 from mi_nerfattack.drives.table import records, with_starts
@@ -280,6 +281,7 @@ FINDINGS: dict[str, tuple[str, Callable[[pd.DataFrame], Finding]]] = {
     "transfer": ("whether attacks transfer", transfer),
     "light": ("whether attacks survive other light and wheels", light),
     "parts": ("which part of `vary` helps", vary_parts),
+    "repaired": ("whether the policy is repaired", repaired),
     "limits": ("what limits attacks", limits),
     "surrogate": ("how good the surrogate must be", fit_quality),
     "country": ("whether the attack works at a second place", country),

@@ -108,11 +108,11 @@ class Retrain:
             BEFORE,
             OLD,
             Comparison,
+            with_policy,
             write_comparison,
         )
         from mi_nerfattack.experiment.transfer.found import read_found
         from mi_nerfattack.report.table import card_table, retrain_table
-        from mi_nerfattack.system.workers import chosen_workers
         from mi_nerfattack.training.dataset import find_shards
 
         training = self._user_training()
@@ -121,35 +121,25 @@ class Retrain:
         attacks = read_found([*self.run_folders, *self.held_out])
         policy, place = self._policy(attacks, training), self._place(attacks)
         order = self._order(policy, training)
-        old_shards = [path for folder in self.more for path in find_shards(folder)]
+        old_shards = find_shards(*self.more)
         groups, others = self._groups(attacks)
         settings = self._settings(policy.attacked, place)
         sites = self._sites(place, settings, attacks[0].scenario.vehicle)
-        # a server that keeps a state would mix the drives of several processes
-        from mi_nerfattack.scenario.policy.kinds import HttpSection
-
-        alone = isinstance(policy.attacked, HttpSection)
-        workers = chosen_workers(self.workers, alone)
+        workers = self._workers(policy.attacked)
         frames = FramesAmong(
             sites, groups[OLD], settings, folder=self.data, workers=workers
         )
-        names = self.environments
-        drives = Comparison(groups, names, self.runs, self.spp, self.data)
+        drives = Comparison(groups, self.environments, self.runs, self.spp, self.data)
         with StageBars() as bars:
             before = drives.drive(BEFORE, workers, bars.counter)
-            shards = frames.collect(bars.show) if training else []
-            card = (
-                {}
-                if training
-                else self._fine_tune(frames, policy, old_shards, bars=bars)
-            )
-        trained: dict[str, Any] = {}
-        if training:  # without bars, which the output of a command would break
-            trained = self._train(
-                training, order, policy, shards=shards, attack=groups[OLD][0]
-            )
+        card, trained = {}, {}
+        if training is None:
+            card = self._fine_tune(frames, policy, old_shards)
+        else:
+            trained = self._train(training, order, policy, frames)
+        setting = policy.setting(self.output)
+        workers = self._workers(with_policy(groups[OLD][0], setting).scenario.policy)
         with StageBars() as bars:
-            setting = policy.setting(self.output)
             after = drives.drive(AFTER, workers, bars.counter, setting)
             anew = self._adapt(
                 drives, before, after, policy=setting, workers=workers, bars=bars
@@ -206,7 +196,8 @@ class Retrain:
         if training is None:
             attacked_weights(attacks)  # refuses all but PilotNet
         policy = Successor(attacked_policy(attacks))
-        if policy.file is not None and self.output.resolve() == policy.file.resolve():
+        needed = [Successor(attack.scenario.policy).file for attack in attacks]
+        if self.output.resolve() in [file.resolve() for file in needed if file]:
             raise InputError(
                 f"{self.output}: is the policy that was attacked, which its runs "
                 "still need; choose another file with -o"
@@ -238,16 +229,17 @@ class Retrain:
         frames: FramesAmong,
         policy: Successor,
         old_shards: Sequence[Path],
-        bars: StageBars,
     ) -> dict[str, Any]:
         """Train PilotNet further, and write it; return its card."""
+        from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.policy.pilotnet import PilotNet
         from mi_nerfattack.training.record import training_record, write_trained
 
-        if not old_shards:
-            bars.say("no --more: trained on new frames alone, it may forget others")
         assert policy.file is not None
-        result = frames.imitate(PilotNet.load(policy.file), old_shards, bars.show)
+        with StageBars() as bars:
+            if not old_shards:
+                bars.say("no --more: trained on new frames alone, it may forget others")
+            result = frames.imitate(PilotNet.load(policy.file), old_shards, bars.show)
         command = command_line("retrain", self)
         record = training_record(
             frames.settings, frames.sites, self.data, result=result, command=command
@@ -260,20 +252,23 @@ class Retrain:
         training: AbstractUserTraining,
         order: TrainingOrder,
         policy: Successor,
-        shards: Sequence[Path],
-        attack: FoundAttack,
+        frames: FramesAmong,
     ) -> dict[str, Any]:
         """Let somebody else's training write the new policy; return what it was."""
+        from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.experiment.retrain.new_policy import install, try_policy
         from mi_nerfattack.experiment.retrain.user_training import train_once
         from mi_nerfattack.training.record import count_frames
 
-        record = train_once(
-            training,
-            order,
-            shards,
-            check=lambda: try_policy(attack, policy.setting(order.out), self.adaptive),
-        )
+        with StageBars() as bars:
+            shards = frames.collect(bars.show)
+
+        def check() -> str:
+            setting = policy.setting(order.out)
+            return try_policy(frames.attacks[0], setting, self.adaptive)
+
+        # without bars, which the output of a command would break
+        record = train_once(training, order, shards, check)
         install(order.out, self.output)
         return {"training": {**record, "frames": count_frames(self.data, shards)}}
 
@@ -294,8 +289,7 @@ class Retrain:
 
         if not self.adaptive:
             return []
-        show = bars.counter("attacking anew", "attack ")
-        folder = self.data / ADAPTIVE
+        show, folder = bars.counter("attacking anew", "attack "), self.data / ADAPTIVE
         anew = attack_anew(
             drives.groups[OLD], policy, folder, workers=workers, progress=show
         )
@@ -303,6 +297,14 @@ class Retrain:
         after.update(again.drive(AFTER, workers, bars.counter))
         before[ADAPTIVE] = before[OLD]  # past the attacks on the policy before
         return anew
+
+    def _workers(self, policy: AbstractPolicySection) -> AbstractWorkers:
+        """Return who drives a policy."""
+        from mi_nerfattack.scenario.policy.kinds import HttpSection
+        from mi_nerfattack.system.workers import chosen_workers
+
+        # A server that keeps a state would mix the drives of several processes
+        return chosen_workers(self.workers, isinstance(policy, HttpSection))
 
     def _place(self, attacks: Sequence[FoundAttack]) -> Place:
         from mi_nerfattack.experiment.retrain.among import found_place

@@ -118,6 +118,7 @@ class Train:
         from mi_nerfattack.report.table import card_table
         from mi_nerfattack.scenes import resolve
         from mi_nerfattack.system.workers import Processes, available_cores
+        from mi_nerfattack.training.dataset import find_shards
         from mi_nerfattack.training.imitate import collect_frames, imitate
         from mi_nerfattack.training.record import (
             count_frames,
@@ -146,7 +147,7 @@ class Train:
             lines = [f"{self.data / name}: {n} frames" for name, n in counts.items()]
             return Result({"data": counts}, lambda: print("\n".join(lines)))
         start = self.start and PilotNet.load(resolve(str(self.start)))
-        earlier_shards = self._earlier_shards()
+        earlier_shards = find_shards(*self.more)
         with StageBars() as bars:
             result = imitate(
                 sites,
@@ -344,8 +345,3 @@ class Train:
         if self.frames_only:
             overrides["dagger_rounds"] = 0
         return replace(find_preset(self.preset), **overrides)
-
-    def _earlier_shards(self) -> list[Path]:
-        from mi_nerfattack.training.dataset import find_shards
-
-        return [shard for folder in self.more for shard in find_shards(folder)]

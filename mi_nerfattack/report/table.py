@@ -262,9 +262,9 @@ def retrain_table(document: Document) -> Table:
         Column("attacks out", _OUT, short="attacks\nout"),
     ]
     caption = (
-        f"Before and after fine-tuning on {len(document.get('runs', ()))} attacks, "
-        "from unseen starts. Mean distances from the lane centre (m), with 95 % "
-        "intervals over attacks; how many attacks have a wheel out for a second."
+        f"Before and after retraining on {len(document['runs'])} attacks, from unseen "
+        "starts. Mean distances from the lane centre (m), 95 % intervals over attacks, "
+        "ratio to the mean without objects, attacks with a wheel out for a second."
     )
     if document.get("adaptive"):
         caption += (

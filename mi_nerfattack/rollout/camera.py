@@ -131,12 +131,14 @@ class SceneCamera:
 
     def _draw(self, count: int, step: int) -> tuple[mi.Sampler, Any, mi.Point2f]:
         """Return a sampler, places in pixels (2, n) from 0 to 1, and on apertures."""
+        # The integrator's numbers: a stream for each ray of each drive
         rays = self.per_image
         seed, period = dr.opaque(mi.UInt32, self.seed), dr.opaque(mi.UInt32, step)
         sampler = keyed_sampler(seed, period, self.first * rays, count=count * rays)
         lens = self.sensor.needs_aperture_sample()
         if self.centred and not lens:
             return sampler, self._centres(count * rays), mi.Point2f(0)
+        # Places in pixels and on the aperture, alike in all drives of the batch
         own = self.sensor.sampler().clone()
         own.set_samples_per_wavefront(self.spp)
         own.seed(mi.sample_tea_32(seed, period)[0], rays)
@@ -199,6 +201,7 @@ class SceneCamera:
             count: of vehicles.
         """
         assert self.variation is not None  # else nobody asks
+        # Factors of the light, drawn once for each size of a batch
         if count not in self._lights:
             drawn = self.variation.draws(self.first, count).light
             light = mi.Color3f(*(mi.Float(channel.tolist()) for channel in drawn))

@@ -102,7 +102,7 @@ class SceneImages:
     ) -> Any:
         """See :meth:`AbstractDifferentiableSensor.vjp`."""
         # From the developed image back to the radiance of each sample
-        d_linear = vjp(_develop, observation.linear, _colours(d_image))
+        d_linear = vjp(dr.linear_to_srgb, observation.linear, _colours(d_image))
         leaf, view = None, observation.view
         count, step = dr.width(state), observation.step
         if attached:
@@ -194,16 +194,12 @@ def _observation(
 ) -> Observation:
     width, height = camera.size
     with dr.suspend_grad():
-        pixels = dr.ravel(_develop(linear))
+        pixels = dr.ravel(dr.linear_to_srgb(linear))
         dr.eval(pixels)
     image = mi.TensorXf(pixels, (count, height, width, 3))
     return Observation(
         image, step, linear, integrator_state=integrator_state, view=view
     )
-
-
-def _develop(linear: mi.Color3f) -> mi.Color3f:
-    return dr.linear_to_srgb(linear)
 
 
 def _colours(image: Any) -> mi.Color3f:

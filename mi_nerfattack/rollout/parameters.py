@@ -79,10 +79,6 @@ class Differentiated:
                 )
         self.keys = tuple(keys)
 
-    def values(self) -> dict[str, Any]:
-        """Return the values of the selected parameters, by key."""
-        return {key: self.params[key] for key in self.keys}
-
     def assign(self, values: Mapping[str, Any]) -> None:
         """See :meth:`AbstractDifferentiableSensor.set_parameters`."""
         for key, value in values.items():
@@ -105,6 +101,7 @@ class Differentiated:
     def _start(self, keys: list[str]) -> None:
         if self._collector is not None:
             self._collector.start_gradient(self._scene, keys)
+        # Parameters outside of packed arrays: each one is a leaf
         for key in keys:
             if self.packed(key) is None:
                 value = self.params[key]
@@ -114,6 +111,7 @@ class Differentiated:
                 self.params[key] = self._leaves[key] = leaf
         if self._leaves:  # an update evaluates the values of all parameters
             self.params.update()
+        # Colours and densities: a leaf for each packed array
         fields = {id(field): field for key in keys if (field := self.packed(key))}
         for field in fields.values():
             before = start_gradient(field)
@@ -143,6 +141,7 @@ class Differentiated:
         """Leave no parameter attached; what has been replaced since stays so."""
         if self._collector is not None:
             self._collector.stop_gradient()
+        # Put values back, except where somebody has replaced them since
         for key, value in self._before.items():
             if _is_same(self.params[key], self._leaves[key]):
                 self.params[key] = value

@@ -291,10 +291,6 @@ class SceneSensor(AbstractDifferentiableSensor):
         """See :meth:`AbstractDifferentiableSensor.select`; keys of :attr:`params`."""
         self._parameters.select(keys)
 
-    def parameters(self) -> dict[str, Any]:
-        """Return the values of the parameters that are differentiated, by key."""
-        return self._parameters.values()
-
     def set_parameters(self, values: Mapping[str, Any]) -> None:
         """See :meth:`AbstractDifferentiableSensor.set_parameters`."""
         self._parameters.assign(values)

@@ -16,8 +16,8 @@ from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
 from mi_nerfattack.system.machine import release_heap
 from mi_nerfattack.vehicle.dynamics import controls_as, no_control, to_state
 
-#: Images that go back through the policy at once: what it does with one costs more.
-IMAGES = 4
+#: Images that go back through the policy at once.
+POLICY_BATCH = 4
 
 
 @dataclass(frozen=True)
@@ -270,7 +270,7 @@ def backward(
     """
     sensor = differentiable(loop)
     alone = options.attached or options.recorder is not None  # one period at a time
-    together = 1 if alone else max(1, IMAGES // drive.count)
+    together = 1 if alone else max(1, POLICY_BATCH // drive.count)
     if options.recorder is not None and not sensor.textures():
         raise InputError(
             "recorder: takes apart the gradient of objects' colours; the sensor's "
@@ -335,8 +335,8 @@ def backward_to_images(
         if index in steps:
             d_images[index] = d_image.numpy().copy()
 
-    sweep = Sweep(loop, drive, attached, on_image=keep)
-    policy = loop.policy
+    sweep, policy = Sweep(loop, drive, attached, on_image=keep), loop.policy
+    # Not linked: frames that nobody asked for are skipped
     linked = attached or bool(policy.initial_memory(drive.count) or policy.numbers)
     d_before, start = to_state(np.zeros_like(d_states[0])), min(steps, default=0)
     try:

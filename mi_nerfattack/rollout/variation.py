@@ -93,8 +93,10 @@ class Variation:
 
     def draws(self, first: int, count: int) -> Draws:
         """Draw for `count` drives, of which the first has the number `first`."""
+        # Row k belongs to drive k, whatever the batch
         random = np.random.default_rng([self.seed, _STREAM])
         normal = random.normal(size=(first + count, 8))[first:].T
+        # Streams of their own, which leave the draws above as they are
         lags, delays = (
             abs(np.random.default_rng([self.seed, stream]).normal(size=first + count))
             for stream in (_LAGS, _DELAYS)

@@ -225,17 +225,19 @@ def shard_columns(
     return columns if states is None else columns | vars(states)
 
 
-def find_shards(folder: str | Path) -> list[Path]:
-    """Return the shards anywhere below a folder, in order of their names.
+def find_shards(*folders: str | Path) -> list[Path]:
+    """Return the shards anywhere below each folder, in order of their names.
 
     Raises:
-        InputError: there are none.
+        InputError: a folder has none.
     """
-    shards = sorted(Path(folder).rglob(SHARDS))
-    if not shards:
-        raise InputError(
-            f"{folder}: no frames in it; give a folder of 'mi-nerfattack train'"
-        )
+    shards: list[Path] = []
+    for folder in folders:
+        shards += (own := sorted(Path(folder).rglob(SHARDS)))
+        if not own:
+            raise InputError(
+                f"{folder}: no frames in it; give a folder of 'mi-nerfattack train'"
+            )
     return shards
 
 

@@ -263,6 +263,45 @@ def test_a_field_is_too_poor_if_the_interval_of_its_ratio_lies_below_one():
     assert fit_quality(level, psnr).title.startswith("No poorer field is shown")
 
 
+def retrained(departed: bool) -> pd.DataFrame:
+    """Return drives with attacks at five places, before and after a retraining.
+
+    Args:
+        departed: whether adaptive attacks make the new policy leave its lane.
+    """
+    after = {"old": 0.25, "held_out": 0.5, "adaptive": 0.75}
+    return pd.DataFrame(
+        {"group": group, "policy": policy, "environment": environment}
+        | {"attack": f"left-cars-gradient-{seed}-{policy * (group == 'adaptive')}"}
+        | {"route": "left", "case": case, "condition": "day"}
+        | {"cross_track_mean_m": (1 + seed) * (error if policy == "after" else 1.0)}
+        | {"departed": policy == "before" or (departed and group == "adaptive")}
+        for group, share in after.items()
+        for policy in ("before", "after")
+        for environment in ("surrogate", "mitsuba")
+        for seed in range(5)
+        for case, error in (("attack", share), ("no_object", 1.1))
+    )
+
+
+def test_a_policy_is_repaired_where_no_drive_leaves_the_lane():
+    answer = made("repaired", retrained(departed=True))
+    words = "against old and held-out attacks, not against adaptive attacks"
+    assert answer.title.endswith(words)
+    left = "0 of 10 (old), 0 of 10 (held-out), 10 of 10 (adaptive)."
+    assert answer.sentences[0].endswith(left)
+    _, errors, aims = answer.sentences
+    assert "is 0.25 times" in errors and "attacks 0.75 times" in errors
+    assert "0.25 times this error near old attacks (reaches" in aims
+    assert "1.10 times this error without objects (reaches" in aims
+    assert answer.rows[5] == [
+        *("adaptive", "`mitsuba`", "5", "3.000", "2.250", "0.75", "0.75 to 0.75"),
+        *("5/5", "5/5"),
+    ]
+    good = made("repaired", retrained(departed=False))
+    assert good.title.endswith("against old, held-out and adaptive attacks")
+
+
 def test_limits_counts_places_beyond_the_lane():
     rows = [
         {"place": f"{route}-{kind}-{seed}", "pixels": 10, "moved": 0.1 * number}

@@ -218,6 +218,17 @@ def test_options_that_do_not_fit_are_told(run, tmp_path, capsys):
     assert retrain(tmp_path, run, "-o", policy) == 2
     assert "is the policy that was attacked" in capsys.readouterr().err
     assert policy.read_bytes() == before
+    twin = Path(shutil.copytree(run, tmp_path / "twin"))
+    assert retrain(tmp_path, run, "--held-out", twin) == 2
+    assert f"twin: is a copy of {run}" in capsys.readouterr().err
+    # a copy of the policy, which another run needs
+    near = changed(run, tmp_path / "near", ("-13.0, 3.4", "-12.0, 3.4"))
+    copy = Path(shutil.copy(policy, tmp_path / "copy.safetensors"))
+    toml = (near / "scenario.toml").read_text()
+    (near / "scenario.toml").write_text(toml.replace(str(policy), str(copy)))
+    assert retrain(tmp_path, run, near, "-o", copy) == 2
+    assert "is the policy that was attacked" in capsys.readouterr().err
+    assert copy.read_bytes() == before
     blocked = changed(run, tmp_path / "blocked", ("-13.0, 3.4", "-13.0, 0.4"))
     assert retrain(tmp_path, blocked) == 2
     assert "none can be driven by the expert" in capsys.readouterr().err

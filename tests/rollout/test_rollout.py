@@ -187,7 +187,7 @@ def test_memory_does_not_grow_with_the_horizon(monkeypatch):
 def test_the_heap_is_released_after_each_derivative_of_the_policy(monkeypatch):
     calls = []
     monkeypatch.setattr(sweep, "release_heap", lambda: calls.append(None))
-    gradient(make_rollout(toy.make_loop()[0], 2 * sweep.IMAGES + 1))
+    gradient(make_rollout(toy.make_loop()[0], 2 * sweep.POLICY_BATCH + 1))
     assert len(calls) == 3
 
 
@@ -203,7 +203,7 @@ def test_periods_together_give_the_gradient_of_periods_alone(
     loop, _ = toy.make_loop(**changes)
     rollout = make_rollout(loop, 11, adjoint=adjoint)
     together = texture_gradient(rollout, POSES)
-    monkeypatch.setattr(sweep, "IMAGES", 1)
+    monkeypatch.setattr(sweep, "POLICY_BATCH", 1)
     monkeypatch.setattr(rays, "FIRST_RAYS", 1)
     alone = texture_gradient(rollout, POSES)
     assert np.linalg.norm(alone) > 0

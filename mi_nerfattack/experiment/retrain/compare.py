@@ -156,7 +156,7 @@ def table_rows(before: Documents, after: Documents) -> list[dict[str, Any]]:
         of `transfer.json`, and two ratios of mean errors. ``attack_to_clean``, by
         stage: the error with attacks as a multiple of the error without objects.
         ``clean_ratio``: the error without objects after the retraining, as a multiple
-        of the error before.
+        of the error before. A multiple of 0 m is None.
     """
     rows = []
     for group, first in before.items():
@@ -172,8 +172,12 @@ def table_rows(before: Documents, after: Documents) -> list[dict[str, Any]]:
                     "environment": old["environment"],
                     "attacks": old["attacks"],
                     **stages,
-                    "attack_to_clean": {k: attack[k] / clean[k] for k in stages},
-                    "clean_ratio": clean[AFTER] / clean[BEFORE],
+                    "attack_to_clean": {k: _ratio(attack[k], clean[k]) for k in stages},
+                    "clean_ratio": _ratio(clean[AFTER], clean[BEFORE]),
                 }
             )
     return rows
+
+
+def _ratio(error_m: float, reference_m: float) -> float | None:
+    return error_m / reference_m if reference_m else None

@@ -19,6 +19,7 @@ from mi_nerfattack.io import files
 from mi_nerfattack.io.locks import exclusive
 from mi_nerfattack.io.resumable import json_digest
 from mi_nerfattack.scenario.user_code import helper_files, load_function
+from mi_nerfattack.training.dataset import SHARDS
 
 #: What may stand between braces in a command, and what it becomes.
 PLACEHOLDERS = {
@@ -273,9 +274,15 @@ def train_once(
         what decided about the training.
 
     Raises:
-        InputError: another process works in the folder; the training fails, or writes
-            nothing that can be used.
+        InputError: another process works in the folder; it holds other frames, too;
+            the training fails, or writes nothing that can be used.
     """
+    asked = {path.resolve() for path in shards}
+    if others := set(order.data.rglob(SHARDS)) - asked:
+        raise InputError(
+            f"{min(others)}: is of other --frames, and the training would read it; "
+            "choose another --data, or remove the file"
+        )
     folder = files.make_folder(order.out.parent)
     identity = {
         training.option.lstrip("-"): training.text,
@@ -313,9 +320,23 @@ DONE = "done.json"
 def _is_done(
     folder: Path, name: str, identity: Mapping[str, Any], check: Callable[[], str]
 ) -> bool:
-    """Whether a training was done, and the file that came of it is still there."""
+    """Whether a training was done, and the file that came of it is still there.
+
+    Raises:
+        InputError: it is there, but `check` refuses it, which may be for another
+            reason, such as a server that is down; nothing is removed.
+    """
     try:
         record = files.read_json(folder / DONE)
-        return record == {"about": identity, "file": name, "policy": check()}
-    except InputError:  # nothing was done yet, or it is no longer usable
+    except InputError:  # nothing was done yet
         return False
+    known = isinstance(record, dict) and (record.get("about"), record.get("file"))
+    if known != (identity, name) or not (folder / name).is_file():
+        return False
+    try:
+        return record["policy"] == check()
+    except InputError as err:
+        raise InputError(
+            f"{folder / name}: was trained and cannot be used: {err}; correct the "
+            f"cause, or remove {folder / DONE} to train again"
+        ) from err

@@ -142,14 +142,22 @@ def read_found(folders: Sequence[Path]) -> tuple[FoundAttack, ...]:
     """Read run folders.
 
     Raises:
-        InputError: none or one twice, a folder holds no finished attack, or a file
-            that its scenario names has changed since.
+        InputError: none, or one twice or with its copy; a folder holds no finished
+            attack; or a file that its scenario names has changed since.
     """
     paths = [os.path.abspath(folder) for folder in folders]
     if not paths or len(set(paths)) < len(paths):
         raise InputError("RUN: at least one run folder, each once")
     pairs = zip(folders, folder_labels(folders), strict=True)
-    return tuple(_read(Path(path), label) for path, label in pairs)
+    attacks = tuple(_read(Path(path), label) for path, label in pairs)
+    first: dict[str, FoundAttack] = {}
+    for attack in attacks:
+        content = json_digest([attack.digest, dict(attack.identity)])
+        if (other := first.setdefault(content, attack)) is not attack:
+            raise InputError(
+                f"{attack.folder}: is a copy of {other.folder}; give each run once"
+            )
+    return attacks
 
 
 def _read(folder: Path, label: str) -> FoundAttack:

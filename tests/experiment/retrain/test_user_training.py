@@ -114,6 +114,32 @@ def test_what_was_trained_is_trained_again_where_something_differs(tmp_path):
     assert runs(order) == 7
 
 
+def test_what_was_trained_is_kept_where_it_cannot_be_checked(tmp_path):
+    """For example, because a server is down."""
+    order, training = order_in(tmp_path), command(tmp_path, WRITES, ALL)
+    train(training, order)
+
+    def check() -> str:
+        raise InputError("url: no answer")
+
+    shards = [order.data / "shard"]
+    with pytest.raises(InputError, match="no answer; correct the cause, or"):
+        train_once(training, order, shards, check)
+    train(training, order)
+    assert runs(order) == 1 and order.out.read_text() == "3"
+
+
+def test_frames_that_were_not_asked_for_are_refused(tmp_path):
+    """A training reads all frames of the folder."""
+    order, training = order_in(tmp_path), command(tmp_path, WRITES, ALL)
+    other = order.data / "mitsuba" / "shard_0.safetensors"
+    other.parent.mkdir()
+    other.touch()
+    with pytest.raises(InputError, match=r"shard_0.safetensors: is of other --frames"):
+        train(training, order)
+    train_once(training, order, [order.data / "shard", other], order.out.read_text)
+
+
 def test_a_module_is_called_here(tmp_path):
     (tmp_path / "mine.py").write_text(
         "def train(data, out, seed):\n    out.write_text(f'{data.name} {seed}')\n"

@@ -1,0 +1,173 @@
+"""The finding about retraining: what is left of old, held-out and adaptive attacks."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from bench.studies.charts import draw_ratios
+from bench.studies.content import (
+    ERROR,
+    Finding,
+    deployment_of,
+    ends_cell,
+    geometric_interval,
+    interval_words,
+    with_labels,
+)
+from mi_nerfattack.evaluation.summary import Interval
+from mi_nerfattack.experiment.retrain.compare import (
+    ADAPTIVE,
+    AFTER,
+    BEFORE,
+    HELD_OUT,
+    OLD,
+)
+from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT
+from mi_nerfattack.scenario.deployment import SURROGATE
+
+#: Names of the groups, in sentences.
+GROUPS = {OLD: "old", HELD_OUT: "held-out", ADAPTIVE: "adaptive"}
+#: Of bench/repair.toml: most that the errors with old attacks and without objects may
+#: be after the retraining, as multiples of the error without objects before it.
+AIMS = {ATTACK: 1.2, NO_OBJECT: 1.1}
+
+
+def repaired(drives: pd.DataFrame) -> Finding:
+    """Compare drives of the policy before and after the retraining, paired by place.
+
+    Args:
+        drives: ``NAME-retrain.csv`` of ``mi-nerfattack retrain``.
+    """
+    where = deployment_of(drives)
+    compared = {
+        (group, environment): _compare(drives, group, environment)
+        for group in GROUPS
+        for environment in (SURROGATE, where)
+    }
+    left = {g: sum(compared[g, e].out[1] for e in (SURROGATE, where)) for g in GROUPS}
+    counts = {g: sum(compared[g, e].drives for e in (SURROGATE, where)) for g in GROUPS}
+    listed = (f"{left[g]} of {counts[g]} ({name})" for g, name in GROUPS.items())
+    old, adaptive = compared[OLD, where], compared[ADAPTIVE, where]
+    errors = _aimed(drives)
+    return Finding(
+        title=_title({group: not count for group, count in left.items()}),
+        sentences=(
+            "A group of attacks counts as repaired if no drive with one of them leaves "
+            f"the lane, in the surrogate and in `{where}`. With the new policy, these "
+            f"drives leave the lane: {', '.join(listed)}.",
+            f"In `{where}`, the error near old attacks is {old.ratio:.2f} times as large "
+            f"as before (geometric mean, {interval_words(old.ends, 2)}), and near "
+            f"adaptive attacks {adaptive.ratio:.2f} times "
+            f"({interval_words(adaptive.ends, 2)}).",
+            "The two aims are multiples of the error that the old policy has without "
+            f"objects. The new policy has {errors[ATTACK]:.2f} times this error near "
+            f"old attacks ({_aim(ATTACK, errors)}), and {errors[NO_OBJECT]:.2f} times "
+            f"this error without objects ({_aim(NO_OBJECT, errors)}).",
+        ),
+        head=[
+            *("attacks", "environment", "number", "error before (m)", "after (m)"),
+            *("after, divided by before (geometric mean)", "95 % interval"),
+            *("drives out before", "drives out after"),
+        ],
+        rows=[
+            [GROUPS[group], f"`{environment}`", *one.cells()]
+            for (group, environment), one in compared.items()
+        ],
+        draw=lambda figure: draw_ratios(
+            figure,
+            {f"{GROUPS[g]}, {e}": (x.ratio, x.ends) for (g, e), x in compared.items()},
+        ),
+        pandas="own = drives.query(\"case == 'attack'\")\n"
+        'rows = ["group", "environment"]\n'
+        'print(own.pivot_table("cross_track_mean_m", rows, "policy"))',
+        threats=(
+            "Old attacks know the old policy, and adaptive attacks know the new one. "
+            "Both have equal places and budgets.",
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """Drives with attacks of one group in one environment, before and after.
+
+    Attributes:
+        places: number of attacks.
+        means: errors before and after, metres.
+        ratio: of both errors, geometric mean over the places.
+        ends: of its interval.
+        out: drives that leave the lane, before and after.
+        drives: of each policy.
+    """
+
+    places: int
+    means: tuple[float, float]
+    ratio: float
+    ends: Interval
+    out: tuple[int, int]
+    drives: int
+
+    def cells(self) -> list[str]:
+        """Return a row of the table."""
+        means = [f"{mean:.3f}" for mean in self.means]
+        out = [f"{count}/{self.drives}" for count in self.out]
+        ratio = [f"{self.ratio:.2f}", ends_cell(self.ends, 2)]
+        return [str(self.places), *means, *ratio, *out]
+
+
+def _compare(drives: pd.DataFrame, group: str, environment: str) -> _Compared:
+    """Compare both policies, paired by place.
+
+    An adaptive attack is another one than the old attack at its place.
+    """
+    own = with_labels(drives[drives["case"] == ATTACK])
+    own = own[(own["group"] == group) & (own["environment"] == environment)]
+    place = ["route", "seed"] if group == ADAPTIVE else ["attack"]
+    errors: Any = own.pivot_table(ERROR, place, "policy", sort=False)
+    logs = errors[AFTER].map(math.log) - errors[BEFORE].map(math.log)
+    by_policy = own.groupby("policy")["departed"].agg(["sum", "size"])
+    return _Compared(
+        places=len(errors),
+        means=(errors[BEFORE].mean(), errors[AFTER].mean()),
+        ratio=math.exp(logs.mean()),
+        ends=geometric_interval(logs.to_numpy()),
+        out=(int(by_policy["sum"][BEFORE]), int(by_policy["sum"][AFTER])),
+        drives=int(by_policy["size"][AFTER]),
+    )
+
+
+def _aimed(drives: pd.DataFrame) -> dict[str, float]:
+    """Return the new policy's errors near old attacks and without objects.
+
+    By case, as the largest multiple, over the environments, of the error that the old
+    policy has without objects.
+    """
+    own = drives[drives["group"] == OLD]
+    means: Any = own.groupby(["policy", "case", "environment"])[ERROR].mean()
+    clean = means[BEFORE, NO_OBJECT]
+    return {case: float((means[AFTER, case] / clean).max()) for case in AIMS}
+
+
+def _aim(case: str, errors: dict[str, float]) -> str:
+    verb = "reaches" if errors[case] <= AIMS[case] else "misses"
+    return f"{verb} the aim of at most {AIMS[case]}"
+
+
+def _title(is_repaired: dict[str, bool]) -> str:
+    """Return the title; by group, whether no drive leaves the lane."""
+    good, bad = (
+        _listed([GROUPS[g] for g, is_good in is_repaired.items() if is_good == wanted])
+        for wanted in (True, False)
+    )
+    if not good:
+        return "Retraining does not repair the policy against any group of attacks"
+    title = f"Retraining repairs the policy against {good} attacks"
+    return title + (f", not against {bad} attacks" if bad else "")
+
+
+def _listed(names: list[str]) -> str:
+    return " and ".join([", ".join(names[:-1]), names[-1]] if names[1:] else names)
