@@ -59,8 +59,8 @@ def repaired(drives: pd.DataFrame) -> Finding:
             "A group of attacks counts as repaired if no drive with one of them leaves "
             f"the lane, in the surrogate and in `{where}`. With the new policy, these "
             f"drives leave the lane: {', '.join(listed)}.",
-            f"In `{where}`, the error near old attacks is {old.ratio:.2f} times as large "
-            f"as before (geometric mean, {interval_words(old.ends, 2)}), and near "
+            f"In `{where}`, the error near old attacks is {old.ratio:.2f} times the "
+            f"error before (geometric mean, {interval_words(old.ends, 2)}), and near "
             f"adaptive attacks {adaptive.ratio:.2f} times "
             f"({interval_words(adaptive.ends, 2)}).",
             "The two aims are multiples of the error that the old policy has without "

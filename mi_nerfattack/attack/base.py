@@ -14,6 +14,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.render.posed import move_all, offsets_of
 from mi_nerfattack.rollout.function import Evaluation, Rollout
+from mi_nerfattack.rollout.loop import OnStep
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
 from mi_nerfattack.rollout.sweep import Gradient
 from mi_nerfattack.vehicle.route.route import Route
@@ -162,7 +163,7 @@ class AbstractAttack(ABC):
         return [record.objective for record in self.history]
 
     @abstractmethod
-    def step(self, on_step: Callable[[int], None] | None = None) -> IterationRecord:
+    def step(self, on_step: OnStep | None = None) -> IterationRecord:
         """Do one iteration.
 
         Args:
@@ -223,7 +224,7 @@ class AbstractAttack(ABC):
         """Whether the best parameters were measured by this attack's objective."""
         return not self.history or np.isfinite(self.best_objective)
 
-    def judge_best(self, on_step: Callable[[int], None] | None = None) -> None:
+    def judge_best(self, on_step: OnStep | None = None) -> None:
         """Measure the best parameters again; costs one drive.
 
         Args:

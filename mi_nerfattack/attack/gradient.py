@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
@@ -28,6 +28,7 @@ from mi_nerfattack.backend.arrays import adam_tensors, load_adam
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.posed import move_all, offsets_of
 from mi_nerfattack.rollout.function import Evaluation, Rollout
+from mi_nerfattack.rollout.loop import OnStep
 from mi_nerfattack.rollout.sweep import Gradient, differentiable
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -110,7 +111,7 @@ class GradientAttack(AbstractAttack):
         """Whether there was nothing more to gain at the full rates."""
         return self.plan.has_converged(self._objectives)
 
-    def step(self, on_step: Callable[[int], None] | None = None) -> IterationRecord:
+    def step(self, on_step: OnStep | None = None) -> IterationRecord:
         """Do one iteration.
 
         Args:
@@ -233,7 +234,7 @@ class GradientAttack(AbstractAttack):
         """See ``AbstractAttack.without_gradient``."""
         return np.flatnonzero(~self._depended).tolist() if self.history else []
 
-    def judge_best(self, on_step: Callable[[int], None] | None = None) -> None:
+    def judge_best(self, on_step: OnStep | None = None) -> None:
         """See `AbstractAttack.judge_best`."""
         self.restore_best()
         self.best_objective = np.inf

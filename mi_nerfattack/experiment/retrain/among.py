@@ -65,17 +65,25 @@ class AmongFound(AbstractStaging):
 
     def identity(self) -> dict[str, str]:
         """Return digests of what was found, and of its scenarios."""
-        runs = [
-            (attack.digest, short_digest(attack.identity)) for attack in self.attacks
-        ]
-        return flatten("staging.found", sorted(runs))
+        runs = [_content(attack) for attack in self._sorted]
+        return flatten("staging.found", runs)
 
     def open(
         self, site: AbstractSite, routes: Sequence[Route], settings: CollectSettings
     ) -> AbstractStage:
         """Load nothing yet."""
         del site, routes, settings
-        return _FoundStage(self.attacks)
+        return _FoundStage(self._sorted)
+
+    @property
+    def _sorted(self) -> list[FoundAttack]:
+        """The attacks in an order that does not depend on how they were given."""
+        return sorted(self.attacks, key=_content)
+
+
+def _content(attack: FoundAttack) -> tuple[str, str]:
+    """Return digests of what was found, and of its scenario."""
+    return attack.digest, short_digest(attack.identity)
 
 
 class _FoundStage(AbstractStage):

@@ -119,6 +119,13 @@ def test_a_shard_shows_one_runs_objects_where_its_attack_left_them(attacks, tmp_
     assert numbers == {0, 1}
 
 
+def test_the_order_of_the_runs_decides_nothing(attacks, tmp_path):
+    orders = attacks, attacks[::-1]
+    sites = [take(runs, tmp_path / str(k), 32) for k, runs in enumerate(orders)]
+    states = [[s for item in site.opened for s in item.states] for site in sites]
+    np.testing.assert_array_equal(*states)
+
+
 def test_frames_are_those_of_the_attack(attacks):
     """A vehicle of the collection sees what it sees in a drive of the run."""
     place = found_place(attacks)
