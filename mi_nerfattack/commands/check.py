@@ -84,10 +84,13 @@ class Check:
 
     def _grid(self, show: OnProgress) -> Result:
         from mi_nerfattack.commands.shared.cells import cells_at_a_time
+        from mi_nerfattack.commands.shared.options import check_positive
         from mi_nerfattack.experiment.sweep.forecast import Forecast, sentences
         from mi_nerfattack.experiment.sweep.grid import load_cells
         from mi_nerfattack.experiment.sweep.summary import read_taken
 
+        if self.workers is not None:
+            check_positive(self, "workers")
         taken = read_taken(self.take).rows
         cells = [cell for cell in load_cells(self.file) if cell.id not in taken]
         forecast = Forecast(cells, self.output and self.output.resolve(), show)

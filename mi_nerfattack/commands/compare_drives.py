@@ -47,7 +47,7 @@ class CompareDrives:
         from mi_nerfattack.drives.table import write_steps
         from mi_nerfattack.evaluation.sequential import read_criteria, sentences
         from mi_nerfattack.experiment.real import Course, read_all, real_document
-        from mi_nerfattack.experiment.run_folder import DRIVES
+        from mi_nerfattack.experiment.run_folder import DRIVES, read_finished
         from mi_nerfattack.experiment.transfer.found import read_found
         from mi_nerfattack.io import files
         from mi_nerfattack.report.plots.map import overhead
@@ -64,7 +64,13 @@ class CompareDrives:
         cases = ("no_object", "own", "random", "attack")
         recordings = {case: getattr(self, case) for case in cases}
         drives = read_all(recordings, course, McapTopics.parse(self.topics))
-        of_run = read_drives(attack.folder / DRIVES)
+        routes = read_finished(attack.folder)["routes"].values()
+        closed = {name for environments in routes for name in environments}
+        of_run = [  # an open loop has no distances from the lane centre
+            drive
+            for drive in read_drives(attack.folder / DRIVES)
+            if drive.environment in closed
+        ]
         document = real_document(
             attack, course, of_run, drives=drives, criteria=criteria
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -100,7 +101,7 @@ class DriveCommand:
 
     def _trained(self, config: DriveConfig) -> tuple[DriveConfig, Trained]:
         """Return the drive with the unit and the car of its policy, and the policy."""
-        from mi_nerfattack.car.drive.config import EXPERT, SCHEMES
+        from mi_nerfattack.car.drive.config import EXPERT, PERIOD_S, SCHEMES
         from mi_nerfattack.car.drive.rig import Trained
 
         name = config.policy
@@ -119,6 +120,12 @@ class DriveCommand:
 
             variant.ensure()
             policy = file.section.build(file.views)
+            period_s = PERIOD_S if file.vehicle is None else file.vehicle.dt_s
+            if not math.isclose(period_s, PERIOD_S):
+                raise InputError(
+                    f"{name}: vehicle.dt_s: {period_s:g}; the car gets a control each "
+                    f"{PERIOD_S:g} s: take a policy of this control period"
+                )
             unit, wheelbase_m = file.control()
         config = config.driven_by(unit, wheelbase_m)
         if rig is None:

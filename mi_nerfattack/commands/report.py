@@ -52,7 +52,7 @@ class Report:
 
         check_suffix(self.output, ".html", ".htm", ".md")
         files.check_writable(self.output)
-        if self.output.suffix == ".md":
+        if self.output.suffix.lower() == ".md":
             if len(self.folders) != 1:
                 raise InputError("FOLDER: pages of Markdown are of one each")
             write_markdown(self.output, self.folders[0], self.tuning)

@@ -191,12 +191,12 @@ class PlaceSite(AbstractSite):
         count = max(len(paths), least) if paths else 0
         return [load_grid(path) for path in islice(cycle(paths), count)]
 
-    def load_surroundings(self) -> Surroundings:
-        """Load the place's scene, and all its routes."""
+    def load_surroundings(self, routes: Sequence[Route] = ()) -> Surroundings:
+        """Load the place's scene, and all its routes, or take these routes."""
         place = self.place
         return Surroundings(
             load_scene(place.scene),
-            load_routes(place.routes),
+            routes or load_routes(place.routes),
             place.camera,
             mount=place.mount,
             period=place.period,
@@ -211,6 +211,7 @@ class PlaceSite(AbstractSite):
         return {
             "environment": self.name,
             "files": _checksums(paths),
+            **_order(place.objects),
             "camera": to_colmap(place.camera)[1],
             "mount": place.mount.described(),
             "car": _car(place.car),
@@ -253,6 +254,11 @@ def probe_expert(site: AbstractSite, route: Route) -> list[float]:
         state = route.pose_at(route.length / 2, lateral, heading)
         controls.append(round(float(np.ravel(expert.control(state))[0]), 4))
     return controls
+
+
+def _order(objects: Sequence[Path]) -> dict[str, list[str]]:
+    """Return checksums in the order of several objects, which decides who is shown."""
+    return {"objects": [files.sha256(x) for x in objects]} if objects[1:] else {}
 
 
 def _posed(place: Place) -> dict[str, Any]:

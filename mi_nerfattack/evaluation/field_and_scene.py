@@ -147,7 +147,7 @@ def compare_with_scene(
         ViewRenderer(load_scene(scene_path), options.camera),
         options,
     )
-    arcs = [_stations(route.length, options.spacing_m) for route in routes]
+    arcs = [_stations(route, options.spacing_m) for route in routes]
     total, done, result = sum(map(len, arcs)), 0, []
     for route, stops in zip(routes, arcs, strict=True):
         stations: list[ViewScore] = []
@@ -162,9 +162,14 @@ def compare_with_scene(
     return Comparison(tuple(result), options, time.perf_counter() - started)
 
 
-def _stations(length: float, spacing: float) -> np.ndarray:
-    """Return arc lengths from 0 to the end, `spacing` apart or a little less."""
-    return np.linspace(0, length, int(np.ceil(length / spacing - 1e-9)) + 1)
+def _stations(route: Route, spacing: float) -> np.ndarray:
+    """Return arc lengths from 0 to the end, `spacing` apart or a little less.
+
+    The end of a closed route is its start, and is left out.
+    """
+    count = int(np.ceil(route.length / spacing - 1e-9))
+    arcs = np.linspace(0, route.length, count + 1)
+    return arcs[:-1] if route.closed else arcs
 
 
 @dataclass(frozen=True)

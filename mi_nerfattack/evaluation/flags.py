@@ -50,7 +50,11 @@ def run_flags(
     curve = document.get("curve")
     method = document.get("scenario", {}).get("attack", {}).get("method", {})
     opens = method.get("opening", "none") != "none"
-    if by_gradient and curve is not None and not (opens and _ends_early(document)):
+    if (
+        by_gradient
+        and curve is not None
+        and not (_is_penalised(document) or (opens and _ends_early(document)))
+    ):
         looks = _random_curve(curve["frames"][0], document["baseline"]["objectives"])
         yield from black_box_better(curve, {"random textures": looks})
     for environments in document["routes"].values():
@@ -62,6 +66,12 @@ def run_flags(
         yield f"not converged: {why}; raise its iterations, or frames"
     for name, texture in document["textures"].items():
         yield from _texture(name, texture)
+
+
+def _is_penalised(document: Figures) -> bool:
+    """Whether the curve has a penalty that random textures are judged without."""
+    freedom = document["scenario"]["attack"].get("freedom", {})
+    return bool(freedom.get("total_variation"))
 
 
 def _ends_early(document: Figures) -> bool:

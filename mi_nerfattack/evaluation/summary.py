@@ -173,7 +173,8 @@ def summary(
     - `attacks_out`, `attacks_out_rate_ci95`: attacks whose drives have a wheel out for
       `DEPARTED_S` in the mean, and Wilson's interval of their share;
     - `steps_departed`: sum; `drives_departed`, `departure_rate_ci95`: drives that
-      leave the lane, and Wilson's interval of their share (None for few attacks).
+      leave the lane, and Wilson's interval of their share (None for few attacks, and
+      where an attack has several drives).
 
     Args:
         table: with `cross_track_mean_m`, `wheel_out_s` and `departed`; figures of
@@ -219,9 +220,9 @@ def _figures(
         "attacks_out": out,
         "attacks_out_rate_ci95": share_interval(out, count),
         "drives_departed": left,
-        # drives of few attacks are not independent, however many there are
+        # drives of one attack are not independent, however many there are
         "departure_rate_ci95": share_interval(left, drives)
-        if count >= FEWEST
+        if count == drives
         else None,
     }
     figures |= {name: float(means(name).mean()) for name in _MEANS if name in columns}

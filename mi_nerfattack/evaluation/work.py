@@ -304,7 +304,9 @@ def load_objects(
     if work.cases == (NO_OBJECT,):
         return [], None
     site = PlaceSite(work.environments[0].name, work.place)
-    return site.load_objects(work.settings.most), site.load_surroundings()
+    # Routes of CARLA's leaderboard are XML, which only the evaluation has read
+    read = work.routes if work.place.routes.suffix.lower() == ".xml" else ()
+    return site.load_objects(work.settings.most), site.load_surroundings(read)
 
 
 def _check_workers(work: EvaluateDrives, workers: AbstractWorkers) -> None:

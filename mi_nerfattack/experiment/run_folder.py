@@ -261,6 +261,11 @@ def folder_labels(folders: Sequence[Path]) -> list[str]:
     return [os.path.relpath(path, start) for path in paths]
 
 
+def _stamp(path: Path) -> int | None:
+    """Return when a file was last written, nanoseconds; None if there is none."""
+    return path.stat().st_mtime_ns if path.exists() else None
+
+
 class RunFolder:
     """A folder that this process has claimed, see :func:`claim.claimed`.
 
@@ -289,6 +294,8 @@ class RunFolder:
         self.effort = Effort()
         own = {"format": FORMAT, **identity}
         self._effort = Unit(path / EFFORT, own, Effort, remedy=REMEDY)
+        self._earlier: dict[Path, bytes] = {}
+        self._iterated: int | None = None
 
     def read(self, force: bool, on_notice: Callable[[str], None]) -> None:
         """Take up what a run left; nothing is written.
@@ -318,6 +325,10 @@ class RunFolder:
     def begin(self) -> None:
         """Make the folder ready to work in."""
         locks.remove_partial(self.path)
+        paths = (self.path / SCENARIO, self._effort.path)
+        if self.checkpoint.path.exists() or (self.path / METRICS).exists():
+            self._earlier = {path: path.read_bytes() for path in paths if path.exists()}
+        self._iterated = _stamp(self.checkpoint.path)
         files.write_text(self.path / SCENARIO, self._text)
         self.save(self.effort)
 
@@ -340,9 +351,14 @@ class RunFolder:
     def withdraw(self) -> None:
         """Remove what was begun, unless an iteration of the attack is done.
 
-        To be called where a scenario is refused: corrected, it is another one.
+        To be called where a scenario is refused: corrected, it is another one. A run
+        that was there before gets its scenario and its effort back.
         """
-        if not self.checkpoint.path.exists():
+        if _stamp(self.checkpoint.path) != self._iterated:
+            return
+        for path, content in self._earlier.items():
+            files.write_bytes(path, content)
+        if not self._earlier:
             self.drives.remove()
             self._effort.path.unlink()
             (self.path / SCENARIO).unlink()

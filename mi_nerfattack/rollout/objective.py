@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import drjit as dr
@@ -288,3 +288,16 @@ class Cost:
         unseen = len(drive.states[0]) - len(by_rows)
         by_states = by_rows.reshape(shape).transpose(2, 1, 0)
         return np.pad(by_states, ((0, 0), (0, 0), (0, unseen)))
+
+
+def truncated(objective: AbstractObjective, horizon: int) -> AbstractObjective:
+    """Return an objective for the first control periods of its drive.
+
+    Weights of later periods are left out; an objective of the end takes the new end.
+    """
+    if isinstance(objective, StageSum) and objective.weights is not None:
+        return replace(objective, weights=objective.weights[:horizon])
+    if isinstance(objective, WeightedSum):
+        terms = [(a, truncated(term, horizon)) for a, term in objective.terms]
+        return WeightedSum(tuple(terms))
+    return objective

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import tomlkit
 from pydantic import PlainSerializer, PlainValidator, ValidationInfo, WithJsonSchema
@@ -204,4 +204,7 @@ def portable_text(section: Section, text: str) -> str:
             for part in way:
                 table = table[part]
             table[last] = value.portable
+    token = getattr(getattr(section, "policy", None), "token_file", None)
+    if token is not None:  # it is no result's, and so no leaf
+        cast(Any, document)["policy"]["token_file"] = token.portable
     return tomlkit.dumps(document)

@@ -359,7 +359,7 @@ class AbstractCameraSection(Section):
     @model_validator(mode="after")
     def _check_lens(self) -> Any:
         """Refuse two focal lengths, half of one, and distortion without an inverse."""
-        if self.fx and self.fov_x_deg != self.defaults()["fov_x_deg"]:
+        if self.fx and "fov_x_deg" in self.model_fields_set:
             refuse("fx", "stands beside fov_x_deg; give one of them")
         if self.fy and not self.fx:
             refuse("fy", "stands without fx; give both, or fov_x_deg")

@@ -22,7 +22,7 @@ from mi_nerfattack.io.overrides import set_keys
 from mi_nerfattack.io.strict import parse_toml
 from mi_nerfattack.ranges import Acute, Count, Natural, NonNegative, Positive, Seconds
 from mi_nerfattack.scenario.section import Section, read_section
-from mi_nerfattack.scenes import bundled
+from mi_nerfattack.scenes import BUNDLED, bundled
 from mi_nerfattack.vehicle.route.route import Route
 from mi_nerfattack.vehicle.steering import heading_rate
 
@@ -264,7 +264,8 @@ def read_config(
             if isinstance(value := values.get(key), str) and value.startswith(kind):
                 values[key] = f"{kind}{path.parent / value.removeprefix(kind)}"
         policy = values.get("policy")
-        if isinstance(policy, str) and (path.parent / policy).is_file():
+        elsewhere = (EXPERT, *SCHEMES, BUNDLED)
+        if isinstance(policy, str) and not policy.startswith(elsewhere):
             values["policy"] = str(path.parent / policy)
     name = "drive" if path is None else str(path)
     chosen = {key: value for key, value in options.items() if value is not None}

@@ -73,6 +73,10 @@ class PolicyFile:
             scenario, _ = load_scenario(path, settings=settings)
             rig, vehicle = scenario.rig(), scenario.vehicle
             return cls(name, scenario.policy, rig, vehicle, scenario)
+        if "scene" in values:
+            raise InputError(
+                f"{name}: policy: is missing next to [scene]; add [policy]"
+            )
         sections: dict[str, Any] = {}
         for key, kind in (
             ("policy", PolicySection),
@@ -85,7 +89,7 @@ class PolicyFile:
                 sections[key] = read_section(
                     f"{name}: {key}", kind, value, folder=folder
                 )
-        if sections and values and "scene" not in values:
+        if sections and values:
             raise InputError(
                 f"{name}: {', '.join(values)}: has no effect without [scene]; allowed: "
                 "policy, camera or cameras, vehicle"

@@ -214,9 +214,9 @@ def _camera_poses(
 ) -> tuple[str, np.ndarray, np.ndarray]:
     """Return the topic, times (n,) and poses (n, 4, 4) of the camera, OpenCV axes."""
     of_camera, chosen = np.eye(4), None
-    if topics.camera_pose is not None or _NAMES.camera_pose in log_topics:
-        if topics.vehicle_pose is None:
-            chosen = _choose(path, log_topics, topics, role="camera_pose", kinds=_POSES)
+    known = topics.vehicle_pose is None and _NAMES.camera_pose in log_topics
+    if topics.camera_pose is not None or known:
+        chosen = _choose(path, log_topics, topics, role="camera_pose", kinds=_POSES)
     if chosen is None:
         of_camera = camera_to_body(mount)
         chosen = _choose(path, log_topics, topics, role="vehicle_pose", kinds=_POSES)

@@ -23,7 +23,7 @@ from mi_nerfattack.io.resumable import Unit, array_digest, misfits_reported
 from mi_nerfattack.render.posed import move_all
 from mi_nerfattack.rollout.function import Evaluation, Rollout
 from mi_nerfattack.rollout.loop import OnStep
-from mi_nerfattack.rollout.objective import AbstractObjective, StageSum, WeightedSum
+from mi_nerfattack.rollout.objective import truncated
 from mi_nerfattack.scenario.scenario import Scenario, load_scenario
 from mi_nerfattack.scenario.world import World, build_attack, build_world
 
@@ -182,19 +182,6 @@ def cost_until(rollout: Rollout, evaluation: Evaluation, horizon: int) -> float:
     states = drive.states_numpy()[:, 1 : horizon + 1, : drive.rows]
     costs = truncated(rollout.objective, horizon).costs(states, drive.dt)
     return float(rollout.reduction.reduce(mi.Float64(costs))[0])
-
-
-def truncated(objective: AbstractObjective, horizon: int) -> AbstractObjective:
-    """Return an objective for the first control periods of its drive.
-
-    Weights of later periods are left out; an objective of the end takes the new end.
-    """
-    if isinstance(objective, StageSum) and objective.weights is not None:
-        return replace(objective, weights=objective.weights[:horizon])
-    if isinstance(objective, WeightedSum):
-        terms = [(a, truncated(term, horizon)) for a, term in objective.terms]
-        return WeightedSum(tuple(terms))
-    return objective
 
 
 def product(gradient: Parameters, direction: Parameters) -> float:

@@ -12,6 +12,8 @@ import numpy as np
 from mi_nerfattack.attack.black_box.random_looks import equal_count
 from mi_nerfattack.backend.arrays import allocated_bytes
 from mi_nerfattack.rollout.adjoint import KeptBackgrounds
+from mi_nerfattack.rollout.objective import truncated
+from mi_nerfattack.scenario.attack import FrameMethod
 from mi_nerfattack.scenario.deployment import SURROGATE, labelled
 from mi_nerfattack.scenario.scenario import Scenario
 from mi_nerfattack.scenario.world import World, build_attack, driven_route
@@ -118,7 +120,16 @@ def _iteration(world: World) -> tuple[float, float, float, float]:
     scenario = world.scenario
     periods = min(_PERIODS, world.horizon)
     drive = scenario.drive.model_copy(update={"horizon": periods, "length_m": None})
-    short = replace(world, scenario=scenario.model_copy(update={"drive": drive}))
+    changes: dict[str, Any] = {"drive": drive}
+    if isinstance(method := scenario.attack.method, FrameMethod):
+        frame = min(method.frame, periods - 1)
+        method = method.model_copy(update={"frame": frame})
+        changes["attack"] = scenario.attack.model_copy(update={"method": method})
+    short = replace(
+        world,
+        objective=truncated(world.objective, periods),
+        scenario=scenario.model_copy(update=changes),
+    )
     original = world.appearance()
     try:
         attack = build_attack(short)

@@ -155,7 +155,12 @@ def run_cell(cell: Cell, sweep: Path, on_step: Callable[[], None]) -> None:
         job = Job(scenario, cell.text, policy, output, lambda *progress: on_step())
         job.frames, job.shared = frames, sweep / SHARED
         with one_thread():
-            job.run_claimed(anyway=cell.anyway)
+            document = job.run_claimed(anyway=cell.anyway)
+        if "curve" not in document:
+            raise InputError(
+                f"{output}: was continued with --force, so nobody knows the frames of "
+                "its search; remove the folder, and give the sweep's command again"
+            )
         provenance = asdict(cell) | {"versions": versions()}
         del provenance["text"]  # the run folder's scenario.toml
         files.write_json(output / PROVENANCE, provenance)

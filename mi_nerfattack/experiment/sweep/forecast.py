@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mi_nerfattack.backend.determinism import one_thread
 from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.experiment.checks.check import Check, duration
 from mi_nerfattack.experiment.checks.cost import Cost, estimate
@@ -58,7 +59,8 @@ class Forecast:
             cell, place = first[kind], kind[:2]
             self.on_progress("checking", number, len(kinds), _words(kind))
             if place not in self.refused:
-                self._check(cell, place, drives)
+                with one_thread():  # as each cell of the sweep
+                    self._check(cell, place, drives)
                 if cost := self.costs[kind]:
                     period_s[place] = cost.period_s
             elif place in period_s:

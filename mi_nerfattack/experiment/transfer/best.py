@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from mi_nerfattack.drives.table import records
 from mi_nerfattack.errors import InputError
@@ -42,8 +43,8 @@ def chosen_runs(folders: Sequence[Path], best: int | None) -> list[Path]:
 def best_attacks(sweeps: Sequence[Path], of_route: int) -> list[Path]:
     """Return the folders of the best attacks, route by route, best first.
 
-    They are those with the largest mean error in the surrogate. Of a method at a place
-    the better attack alone counts.
+    They are those with the largest mean error in the surrogate. Of a method at a place,
+    which is a route with its objects and a seed, the better attack alone counts.
 
     Args:
         sweeps: folders of sweeps on the same routes, or copies of their tables.
@@ -52,18 +53,21 @@ def best_attacks(sweeps: Sequence[Path], of_route: int) -> list[Path]:
     Raises:
         InputError: a route has fewer.
     """
-    best: dict[str, dict[tuple[int, str], tuple[float, Path]]] = {}
+    best: dict[str, dict[tuple[Any, ...], tuple[float, Path]]] = {}
     for folder in sweeps:
         table = read_table(folder / RESULTS)
         own = table[(table["environment"] == SURROGATE) & (table["case"] == ATTACK)]
-        by = ["route", "seed", "method", "cell"]
+        by = ["route", "objects", "seed", "method", "cell"]
         for row in records(summary(own, by, ["cell"])):
             known = best.setdefault(row["route"], {})
             candidate = row["cross_track_mean_m"], folder / CELLS / row["cell"]
-            place = row["seed"], row["method"]
+            place = row["objects"], row["seed"], row["method"]
             known[place] = max(candidate, known.get(place, candidate))
     ranked = {route: sorted(own.values(), reverse=True) for route, own in best.items()}
     for route, pairs in ranked.items():
         if len(pairs) < of_route:
-            raise InputError(f"{route}: {len(pairs)} attacks, not {of_route}")
+            raise InputError(
+                f"--best: {of_route}; {route} has {len(pairs)} attacks: lower it, or "
+                "finish the sweep"
+            )
     return [path for pairs in ranked.values() for _, path in pairs[:of_route]]
