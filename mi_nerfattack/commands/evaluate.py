@@ -211,7 +211,7 @@ class Evaluate:
         elif file.keeps_place(self.where) and self.where.routes_file is None:
             assert file.scenario is not None
             names = (file.scenario.scene.route,)
-        if path.suffix == ".xml":
+        if path.suffix.lower() == ".xml":
             return self._leaderboard(path)
         return tuple(load_routes(path, names))
 

@@ -48,13 +48,13 @@ def run_flags(
     if (gain := document.get("least_gain")) is not None:
         yield from _misleading(gain)
     curve = document.get("curve")
-    method = document.get("scenario", {}).get("attack", {}).get("method", {})
+    attack = document.get("scenario", {}).get("attack", {})
+    method = attack.get("method", {})
+    # Random textures are judged without the penalty that is in the curve
+    is_penalised = bool(attack.get("freedom", {}).get("total_variation"))
     opens = method.get("opening", "none") != "none"
-    if (
-        by_gradient
-        and curve is not None
-        and not (_is_penalised(document) or (opens and _ends_early(document)))
-    ):
+    incomparable = is_penalised or (opens and _ends_early(document))
+    if by_gradient and curve is not None and not incomparable:
         looks = _random_curve(curve["frames"][0], document["baseline"]["objectives"])
         yield from black_box_better(curve, {"random textures": looks})
     for environments in document["routes"].values():
@@ -66,12 +66,6 @@ def run_flags(
         yield f"not converged: {why}; raise its iterations, or frames"
     for name, texture in document["textures"].items():
         yield from _texture(name, texture)
-
-
-def _is_penalised(document: Figures) -> bool:
-    """Whether the curve has a penalty that random textures are judged without."""
-    freedom = document["scenario"]["attack"].get("freedom", {})
-    return bool(freedom.get("total_variation"))
 
 
 def _ends_early(document: Figures) -> bool:

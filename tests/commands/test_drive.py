@@ -106,6 +106,13 @@ def test_a_policy_is_driven_in_its_own_unit(tmp_path, section):
         command._trained(read_config(None, options))
 
 
+def test_a_policy_of_another_control_period_is_refused(tmp_path):
+    path = tmp_path / "policy.toml"
+    path.write_text(f'{POLICY}[vehicle]\nkind = "dubins"\ndt_s = 0.05\n')
+    with pytest.raises(InputError, match=r"policy\.toml: vehicle\.dt_s: 0\.05"):
+        DriveCommand()._trained(read_config(None, {"policy": str(path)}))
+
+
 def test_a_policy_drives_the_car_that_it_was_trained_for():
     command, room = DriveCommand(), {"policy": "bundled:room.toml"}
     config, _ = command._trained(read_config(None, room))

@@ -106,6 +106,7 @@ render path scene.xml -o out --route u --routes-file routes.json => no route 'u'
 evaluate nothing.safetensors @place => nothing.safetensors: does not exist
 evaluate nothing.toml @place => nothing.toml: does not exist
 evaluate empty.toml @place => empty.toml: has no section \[policy\]
+evaluate no_policy.toml @place => no_policy.toml: policy: is missing next to \[scene\]
 evaluate key.toml @place => key.toml: policy.colour
 evaluate table.toml @place => table.toml: vehicles: has no effect without \[scene\];
 evaluate noise.bin @place => noise.bin: .*its suffix tells no kind
@@ -140,6 +141,7 @@ car serve none.safetensors => none.safetensors
 car calibrate /dev/none -o scene.xml => exists; choose another
 car calibrate /dev/none -o b --speed-ms 0 => --speed-ms: 0.0; more than 0.195, at
 car calibrate /dev/none -o b --distance-m 50 => --distance-m: 50.0; .* at most 5
+check grid.toml --workers 0 => --workers: 0; more than 0
 export mesh none.safetensors -o out.glb => none.safetensors: does not exist
 export mesh ngp.safetensors -o out.glb => is a ngp_field; a grid_field
 export mesh good.safetensors -o out.obj => give a file that ends in .glb
@@ -189,7 +191,9 @@ TEXTS = {
     "token": "short",
     "noise.safetensors": "noise",
     "flat.toml": FLAT,
-    "empty.toml": "[scene]\n",
+    "empty.toml": "",
+    "no_policy.toml": "[scene]\n[camera]\n",
+    "grid.toml": 'scenario = "flat.toml"\n',
     "key.toml": '[policy]\nfile = "still.py:drive"\ncolour = "red"\n',
     "table.toml": '[policy]\nfile = "a.pt2"\n[vehicles]\n',
 }

@@ -91,6 +91,17 @@ def test_there_are_as_many_objects_as_stand_beside_the_road(tmp_path):
     assert bare.load_objects(2) == []
 
 
+def test_the_order_of_several_objects_counts(tmp_path):
+    place, other = write_place(tmp_path), tmp_path / "other.safetensors"
+    other.write_bytes(b"other")
+
+    def described(*objects):
+        return PlaceSite("mitsuba", replace(place, objects=objects)).describe()
+
+    assert described(*place.objects, other) != described(other, *place.objects)
+    assert "objects" not in described(other)  # digests from before the key stay
+
+
 def test_scatter_has_its_deviations_and_cuts(rng):
     for close_share, part in ((0.0, 1.0), (1.0, 0.2)):
         scatter = Scatter(close_share=close_share)

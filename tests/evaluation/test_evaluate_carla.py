@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from support.devices.carla import Server
+from support.worlds.places import straight, write_place
 
 from mi_nerfattack import cli
 from mi_nerfattack.deploy.carla import environment as carla_environment
 from mi_nerfattack.deploy.carla import session
+from mi_nerfattack.deploy.place import Conditions
+from mi_nerfattack.drives.store import Store
+from mi_nerfattack.evaluation.evaluate import EvaluateSettings
+from mi_nerfattack.evaluation.identity import EnvironmentUnder
+from mi_nerfattack.evaluation.work import EvaluateDrives, load_objects
 from mi_nerfattack.io import files
+from mi_nerfattack.scenario.policy.kinds import HttpSection
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -58,6 +66,23 @@ def test_routes_of_the_leaderboard_are_driven(server, capsys, monkeypatch):
     assert list(json.loads(capsys.readouterr().out)["carla"]) == ["7"]
     assert server.is_as_before
     assert evaluate("mitsuba", "--routes-file", "routes.xml") == 2  # without a town
+
+
+def test_objects_stand_beside_routes_of_the_leaderboard(tmp_path):
+    """Objects keep off the lanes that were followed in the town: the XML has none."""
+    place = replace(write_place(tmp_path), routes=tmp_path / "routes.xml")
+    place.routes.write_text("<routes/>")
+    work = EvaluateDrives(
+        store=Store(tmp_path),
+        policy=HttpSection(kind="http", url="http://a:1"),
+        place=place,
+        environments=(EnvironmentUnder("carla", Conditions()),),
+        routes=(straight(),),
+        settings=EvaluateSettings(),
+    )
+    objects, surroundings = load_objects(work)
+    assert len(objects) == 1 and surroundings is not None
+    assert surroundings.routes == work.routes
 
 
 def test_ctrl_c_gives_the_town_back(server):

@@ -17,6 +17,7 @@ from mi_nerfattack.evaluation.field_and_scene import (
     CompareOptions,
     Comparison,
     RouteComparison,
+    _stations,
     compare_with_scene,
     depth_errors,
     quantile,
@@ -36,6 +37,7 @@ from mi_nerfattack.report.pages.compare import (
     write_compare_report,
 )
 from mi_nerfattack.report.pages.verdict import judge, verdict
+from mi_nerfattack.vehicle.route.route import Route
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -130,6 +132,13 @@ def test_known_offset_in_depth_and_colour(offset):
     (entry,) = table["routes"].values()
     assert entry["frames"] == 3 and entry["stations"][0]["depth_median_m"] is None
     assert table["good_enough"] is False
+
+
+@pytest.mark.parametrize("is_closed", [False, True])
+def test_the_end_of_a_closed_route_is_no_second_station(is_closed):
+    square = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]])
+    route = Route("square", 0, square, closed=is_closed)
+    np.testing.assert_allclose(_stations(route, 4.0), [0, 4, 8, 12])
 
 
 def test_field_that_shows_nothing(place, tmp_path):

@@ -19,6 +19,7 @@ from mi_nerfattack.evaluation.summary import (
     interquartile_mean,
     interval,
     mean_interval,
+    summary,
 )
 
 ERROR, OUT = "cross_track_mean_m", "wheel_out_s"
@@ -148,6 +149,17 @@ def test_departures_by_hand():
     assert compare_departures(sides[1], sides[0]).p_value == departures.p_value
     assert compare_departures(sides[0], sides[0]).p_value is None  # none differ
     assert compare_departures(*sides, least=0.2).both == 7
+
+
+@pytest.mark.parametrize("starts", [1, 2])
+def test_several_drives_of_an_attack_give_no_interval_of_departures(starts):
+    rows = [(k, 0.1, 0.0, k < 2) for k in range(6) for _ in range(starts)]
+    drives = pd.DataFrame(rows, columns=["attack", ERROR, OUT, "departed"])
+    figures = summary(drives.assign(case="attack"), ["case"], ["attack"]).iloc[0]
+    assert figures["drives_departed"] == 2 * starts
+    ends = scipy.stats.binomtest(2, 6).proportion_ci(method="wilson")
+    expected = pytest.approx(list(ends)) if starts == 1 else None
+    assert figures["departure_rate_ci95"] == expected
 
 
 def test_a_run_gives_its_drives_with_their_starts():

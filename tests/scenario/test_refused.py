@@ -19,6 +19,7 @@ name = "test" -> attack.method.max_iterations = 0; name = "a" => :1: attack.meth
 [attack.method]; mean.x = 1; seed = 3; mean.y = 1 => :14: attack.method.mean: unknown
 [mean.x]; y = 1 => :13: mean: unknown
 [camera]; fx = 200; fov_x_deg = 70 => camera.fx: .*fov_x_deg
+[camera]; fx = 200; fov_x_deg = 90.0 => camera.fx: .*fov_x_deg
 [camera]; fy = 200 => camera.fy: .*without fx
 [camera]; fx = 0 => camera.fx: .*greater
 [camera]; k1 = -3 => camera.k1: .*folds

@@ -254,6 +254,13 @@ def test_every_form_of_toml_replays_anywhere(load, tmp_path, old, new):
     assert scenario.objects[0].field.path == Path(tmp_path / name)
 
 
+def test_the_token_of_a_server_is_found_from_anywhere(load, tmp_path):
+    keys = 'url = "http://127.0.0.1:8000"\ntoken_file = "secret/token"'
+    scenario, text = load(HEAD.replace(POLICY, keys))
+    again = replayed(scenario, text, tmp_path / "elsewhere")
+    assert again.policy.token_file.name == str(tmp_path / "secret/token")
+
+
 def test_another_field_for_every_object_replays_anywhere(load, tmp_path):
     scenario, text = load(HEAD, tmp_path / "mine.safetensors")
     for read in (scenario, replayed(scenario, text, tmp_path / "elsewhere")):

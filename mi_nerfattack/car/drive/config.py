@@ -264,9 +264,9 @@ def read_config(
             if isinstance(value := values.get(key), str) and value.startswith(kind):
                 values[key] = f"{kind}{path.parent / value.removeprefix(kind)}"
         policy = values.get("policy")
-        elsewhere = (EXPERT, *SCHEMES, BUNDLED)
+        elsewhere = (*SCHEMES, BUNDLED)
         if isinstance(policy, str) and not policy.startswith(elsewhere):
-            values["policy"] = str(path.parent / policy)
+            values["policy"] = policy if policy == EXPERT else str(path.parent / policy)
     name = "drive" if path is None else str(path)
     chosen = {key: value for key, value in options.items() if value is not None}
     replaced = parse_toml(name, set_keys(name, "", settings))

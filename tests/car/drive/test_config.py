@@ -45,6 +45,25 @@ def test_options_come_before_the_file_whose_paths_start_from_its_folder(tmp_path
     assert settings.limits.speed_ms == 0.4 and settings.speed_ms == 0.4
 
 
+@pytest.mark.parametrize(
+    ("name", "is_file"),
+    [
+        ("gone.toml", True),
+        ("net.py:Net", True),
+        ("expert_net.onnx", True),
+        ("expert", False),
+        ("http://10.0.0.2:8000", False),
+        ("bundled:room.toml", False),
+    ],
+)
+def test_a_policy_is_looked_for_in_the_folder_that_names_it(tmp_path, name, is_file):
+    path = tmp_path / "drive.toml"
+    files.write_text(path, f'policy = "{name}"')
+    files.write_text(tmp_path / "expert", "")
+    expected = str(tmp_path / name) if is_file else name
+    assert read_config(path, {}).policy == expected
+
+
 def test_the_command_line_undoes_what_the_file_says(tmp_path):
     path = tmp_path / "drive.toml"
     text = 'simulated = true\non_block = true\ncalibration = "racecar-j"\n'

@@ -168,6 +168,15 @@ def test_a_log_of_somebody_else(tmp_path):
     np.testing.assert_allclose(recording.track.camera_to_world, POSES, atol=1e-12)
 
 
+def test_the_pose_of_the_camera_comes_before_that_of_the_vehicle(tmp_path):
+    topics = log_messages(tmp_path)
+    topics["/odom"] = topics["/camera/pose"]
+    path = write_log(tmp_path / "drive.mcap", topics)
+    both = McapTopics.parse(["camera_pose=/camera/pose", "vehicle_pose=/odom"])
+    recording = open_recording(path, CAMERA, MOUNT, topics=both)
+    np.testing.assert_allclose(recording.track.camera_to_world, POSES, atol=1e-5)
+
+
 def test_frames_that_a_cut_keeps_but_hides_do_not_count(tmp_path):
     video, path = write_drive_video(tmp_path, table=False), tmp_path / "cut.mp4"
     with av.open(str(video)) as source, av.open(str(path), "w") as target:
