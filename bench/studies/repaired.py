@@ -43,15 +43,17 @@ def repaired(drives: pd.DataFrame) -> Finding:
         drives: ``NAME-retrain.csv`` of ``mi-nerfattack retrain``.
     """
     where = deployment_of(drives)
-    compared = {
-        (group, environment): _compare(drives, group, environment)
-        for group in GROUPS
-        for environment in (SURROGATE, where)
-    }
-    left = {g: sum(compared[g, e].out[1] for e in (SURROGATE, where)) for g in GROUPS}
-    counts = {g: sum(compared[g, e].drives for e in (SURROGATE, where)) for g in GROUPS}
-    listed = (f"{left[g]} of {counts[g]} ({name})" for g, name in GROUPS.items())
-    old, adaptive = compared[OLD, where], compared[ADAPTIVE, where]
+    groups = {g: name for g, name in GROUPS.items() if g in set(drives["group"])}
+    worlds = (SURROGATE, where)
+    compared = {(g, e): _compare(drives, g, e) for g in groups for e in worlds}
+    left = {g: sum(compared[g, e].out[1] for e in worlds) for g in groups}
+    counts = {g: sum(compared[g, e].drives for e in worlds) for g in groups}
+    listed = (f"{left[g]} of {counts[g]} ({name})" for g, name in groups.items())
+    ratios = (
+        f"{one.ratio:.2f} near {name} attacks ({interval_words(one.ends, 2)})"
+        for g, name in groups.items()
+        for one in [compared[g, where]]
+    )
     errors = _aimed(drives)
     return Finding(
         title=_title({group: not count for group, count in left.items()}),
@@ -59,10 +61,8 @@ def repaired(drives: pd.DataFrame) -> Finding:
             "A group of attacks counts as repaired if no drive with one of them leaves "
             f"the lane, in the surrogate and in `{where}`. With the new policy, these "
             f"drives leave the lane: {', '.join(listed)}.",
-            f"In `{where}`, the error near old attacks is {old.ratio:.2f} times the "
-            f"error before (geometric mean, {interval_words(old.ends, 2)}), and near "
-            f"adaptive attacks {adaptive.ratio:.2f} times "
-            f"({interval_words(adaptive.ends, 2)}).",
+            f"In `{where}`, the error of the new policy, divided by that of the old one "
+            f"(geometric mean), is {', '.join(ratios)}.",
             "The two aims are multiples of the error that the old policy has without "
             f"objects. The new policy has {errors[ATTACK]:.2f} times this error near "
             f"old attacks ({_aim(ATTACK, errors)}), and {errors[NO_OBJECT]:.2f} times "

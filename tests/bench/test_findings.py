@@ -291,13 +291,15 @@ def test_a_policy_is_repaired_where_no_drive_leaves_the_lane():
     left = "0 of 10 (old), 0 of 10 (held-out), 10 of 10 (adaptive)."
     assert answer.sentences[0].endswith(left)
     _, errors, aims = answer.sentences
-    assert "is 0.25 times" in errors and "attacks 0.75 times" in errors
+    assert "0.25 near old" in errors and "0.75 near adaptive" in errors
     assert "0.25 times this error near old attacks (reaches" in aims
     assert "1.10 times this error without objects (reaches" in aims
     assert answer.rows[5] == [
         *("adaptive", "`mitsuba`", "5", "3.000", "2.250", "0.75", "0.75 to 0.75"),
         *("5/5", "5/5"),
     ]
+    some = retrained(departed=True).query("group != 'adaptive'")
+    assert made("repaired", some).title.endswith("against old and held-out attacks")
     good = made("repaired", retrained(departed=False))
     assert good.title.endswith("against old, held-out and adaptive attacks")
 
