@@ -294,6 +294,7 @@ class RunFolder:
         self.effort = Effort()
         own = {"format": FORMAT, **identity}
         self._effort = Unit(path / EFFORT, own, Effort, remedy=REMEDY)
+        self._is_other = False  # than the run that was there before
         self._earlier: dict[Path, bytes] = {}
         self._iterated: int | None = None
 
@@ -319,14 +320,15 @@ class RunFolder:
             self.effort, ignored = stored.record, [*ignored, *stored.ignored]
         elif is_new:
             self._check_scenario(force, on_notice)
+        self._is_other = bool(ignored)
         for line in dict.fromkeys(ignored):
             on_notice(f"{self.path}: ignored, as told: {line}")
 
     def begin(self) -> None:
         """Make the folder ready to work in."""
         locks.remove_partial(self.path)
-        paths = (self.path / SCENARIO, self._effort.path)
-        if self.checkpoint.path.exists() or (self.path / METRICS).exists():
+        if self._is_other:
+            paths = (self.path / SCENARIO, self._effort.path)
             self._earlier = {path: path.read_bytes() for path in paths if path.exists()}
         self._iterated = _stamp(self.checkpoint.path)
         files.write_text(self.path / SCENARIO, self._text)
@@ -351,14 +353,14 @@ class RunFolder:
     def withdraw(self) -> None:
         """Remove what was begun, unless an iteration of the attack is done.
 
-        To be called where a scenario is refused: corrected, it is another one. A run
-        that was there before gets its scenario and its effort back.
+        To be called where a scenario is refused: corrected, it is another one. A run of
+        another scenario that was there before gets its scenario and its effort back.
         """
         if _stamp(self.checkpoint.path) != self._iterated:
             return
         for path, content in self._earlier.items():
             files.write_bytes(path, content)
-        if not self._earlier:
+        if not (self._earlier or self.checkpoint.path.exists()):
             self.drives.remove()
             self._effort.path.unlink()
             (self.path / SCENARIO).unlink()

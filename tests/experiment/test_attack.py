@@ -23,12 +23,14 @@ from support.worlds.attacks import checkpoint_of
 import mi_nerfattack as nf
 from mi_nerfattack import cli, scenes
 from mi_nerfattack.deploy import paste_layers
+from mi_nerfattack.evaluation.flags import run_flags
 from mi_nerfattack.evaluation.metrics import validate
 from mi_nerfattack.fields import load_field, load_grid, save_field
 from mi_nerfattack.io import files
 from mi_nerfattack.io.exr import read_layers
 from mi_nerfattack.render.rays import March
 from mi_nerfattack.rollout.drive import CASES
+from mi_nerfattack.scenario.scenario import load_scenario
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -93,6 +95,26 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, finished):
     words = ["-o", str(output), "--pictures", "none"]
     again = ["attack", str(output / "scenario.toml"), *words]
     assert cli.main(again) == 0
+
+
+@pytest.mark.parametrize(("weight", "count"), [(0.0, 1), (0.1, 0)])
+def test_random_textures_are_not_compared_with_a_penalised_objective(
+    scenario_folder, weight, count
+):
+    """A curve that holds a penalty, and random textures judged without one."""
+    path = scenario_folder / "scenario.toml"
+    settings = [f"attack.freedom.total_variation={weight}"]
+    scenario, _ = load_scenario(path, settings=settings)
+    document = {
+        "scenario": scenario.model_dump(mode="json"),
+        "curve": {"frames": [10, 30], "objective": [0.0, -1.0]},
+        "baseline": {"objectives": [-9.0, -9.0, -9.0]},
+        "routes": {},
+        "converged": True,
+        "textures": {},
+    }
+    flags = [flag.partition(":")[0] for flag in run_flags(document, (), True)]
+    assert flags == ["black box better"] * count
 
 
 def assert_counts(document):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from mi_nerfattack.backend.arrays import allocated_bytes
-from mi_nerfattack.experiment.checks.cost import backgrounds_mb
+from mi_nerfattack.experiment.checks.cost import backgrounds_mb, estimate
 from mi_nerfattack.rollout.adjoint import KeptBackgrounds
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.scenario.scenario import load_scenario
@@ -29,3 +29,21 @@ def test_the_memory_of_kept_frames_is_told(scenario_folder):
     assert backgrounds_mb(world) == pytest.approx(truth * 24 / 30, rel=0.3)
     other, _ = load_scenario(path, settings=["attack.adjoint.kind=replay"])
     assert backgrounds_mb(replace(world, scenario=other)) == 0
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        'objective.term=[{kind="cross_track", weights={kind="linear"}}]',
+        'attack.method={kind="single_frame", frame=10}',
+    ],
+    ids=["weights", "frame"],
+)
+def test_a_drive_may_be_longer_than_what_is_timed(scenario_folder, setting):
+    """Weights of 12 periods, and a frame of them, where fewer are timed."""
+    path = scenario_folder / "scenario.toml"
+    scenario, _ = load_scenario(path, settings=["drive.horizon=12", setting])
+    world = build_world(scenario, scenario.build_policy())
+    cost = estimate(world, {})
+    assert cost.horizon == 12
+    assert cost.period_s["forward"] > 0 and cost.period_s["backward"] > 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -18,6 +19,8 @@ from support.worlds.attacks import write_scenario
 from mi_nerfattack import cli
 from mi_nerfattack.drives.spec import FORMAT, DriveSpec
 from mi_nerfattack.drives.store import Store
+from mi_nerfattack.drives.table import STEPS as COLUMNS
+from mi_nerfattack.drives.table import read_csv
 from mi_nerfattack.evaluation.metrics import metrics_document
 from mi_nerfattack.experiment.real import Course, read_real
 from mi_nerfattack.io import files
@@ -172,6 +175,12 @@ beta = 0.1
 """
 
 
+def add(store: Store, drive: Drive) -> None:
+    labels = drive.environment, drive.route, drive.case, drive.run, drive.seed
+    spec = DriveSpec(*labels, STEPS, {"format": FORMAT, "case": drive.case})
+    store.add(spec, drive, 1.0)
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """Make the folder of a finished run without driving."""
@@ -184,9 +193,7 @@ def run(tmp_path_factory):
     drives = [made(LINE, "own", 0.05, k) for k in range(2)]
     drives += [made(LINE, "attack", most, k) for k, most in enumerate((1.4, 1.6))]
     for drive in drives:
-        labels = drive.environment, drive.route, drive.case, drive.run, drive.seed
-        spec = DriveSpec(*labels, STEPS, {"format": FORMAT, "case": drive.case})
-        store.add(spec, drive, 1.0)
+        add(store, drive)
     document = metrics_document({}, 1, drives, {"line": Lane(0.85, 1.75)}, COST)
     files.write_json(folder / "metrics.json", document)
     return folder
@@ -248,6 +255,19 @@ def test_real_drives_are_an_environment_of_the_run(run, tmp_path, capsys):
         "steps.csv",
         "overhead.png",
     }
+
+
+def test_drives_of_an_open_loop_are_left_out(run, tmp_path, capsys):
+    """A replay keeps its drives, and its environment has no row of metrics."""
+    folder, out = shutil.copytree(run, tmp_path / "run"), tmp_path / "compared"
+    drive = replace(made(LINE, "own", 0.05), environment="replay")
+    add(Store(folder / "drives"), drive)
+    code, _, err = call(capsys, folder, "-o", out)
+    assert code == 0, err
+    routes = files.read_json(out / "metrics.json")["routes"]
+    assert list(routes["line"]) == ["surrogate"]
+    steps = read_csv(out / "steps.csv", COLUMNS)
+    assert set(steps["environment"]) == {"surrogate"}
 
 
 def test_recordings_that_are_refused(run, tmp_path, capsys):

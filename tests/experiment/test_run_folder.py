@@ -57,6 +57,25 @@ def test_a_scenario_of_which_nothing_was_done_is_replaced_by_force(folder, tmp_p
     assert (tmp_path / "metrics.json").exists()
 
 
+@pytest.mark.parametrize(
+    ("change", "anyway"),
+    [
+        (("[7.0, 4.2, 1.6]", "[7.0, 4.2, 4.6]"), False),  # refused by the checks
+        (('"object.safetensors"', '"scene.safetensors"'), True),  # by the checkpoint
+    ],
+)
+def test_a_refused_force_leaves_a_finished_run_to_its_scenario(
+    folder, uninterrupted, tmp_path, change, anyway
+):
+    output = shutil.copytree(uninterrupted[0], tmp_path / "run")
+    before = contents(output)
+    with pytest.raises(InputError):
+        job(folder, output, change).run(force=True, anyway=anyway)
+    after = contents(output)
+    assert {path: after.get(path) for path in before} == before
+    assert job(folder, output).run()["cost"]["processes"] == 2
+
+
 def test_failed_checkpoint_leaves_the_one_before(folder, tmp_path, monkeypatch):
     """The disk fills up after the first checkpoint, of iteration 3."""
     before = {}

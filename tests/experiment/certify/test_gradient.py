@@ -13,13 +13,18 @@ from support.faults.refusals import refused_at
 from support.pages.read import drawn
 
 from mi_nerfattack import cli
-from mi_nerfattack.experiment.certify.directions import Ended, truncated
+from mi_nerfattack.experiment.certify.directions import Ended
 from mi_nerfattack.experiment.certify.gradient import certify_gradient, sentences
 from mi_nerfattack.experiment.job import Job
 from mi_nerfattack.io import files
 from mi_nerfattack.report.certificate import gradient_table
 from mi_nerfattack.report.plots.certificate import plot_gradient
-from mi_nerfattack.rollout.objective import StageSum, Terminal, WeightedSum
+from mi_nerfattack.rollout.objective import (
+    StageSum,
+    Terminal,
+    WeightedSum,
+    truncated,
+)
 from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.system.workers import InThisProcess
 from tests.experiment.conftest import write_found

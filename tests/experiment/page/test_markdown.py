@@ -40,6 +40,12 @@ def test_text_around_the_figures_stays(tmp_path):
     assert path.read_text() == f"# Mine{figures}\nEnd.\n"
 
 
+def test_a_suffix_in_capitals_is_one_of_markdown(tmp_path):
+    path = tmp_path / "PAGE.MD"
+    assert cli.main(["report", str(TABLE2), "-o", str(path)]) == 0
+    assert markdown.BEGIN in path.read_text()
+
+
 def test_what_no_page_is_made_of_is_refused(tmp_path, capsys):
     marked, bare = tmp_path / "marked.md", tmp_path / "bare.md"
     bare.write_text("# Mine\n")

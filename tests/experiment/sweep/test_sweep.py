@@ -13,6 +13,7 @@ from mi_nerfattack.drives.store import Store, drive_files, read_drive
 from mi_nerfattack.drives.table import read_csv, records, write_csv
 from mi_nerfattack.errors import InputError, RefusedError
 from mi_nerfattack.experiment.cases import Cases
+from mi_nerfattack.experiment.job import Job
 from mi_nerfattack.experiment.sweep.cell import folder_of, is_complete, run_cell
 from mi_nerfattack.experiment.sweep.grid import load_cells
 from mi_nerfattack.experiment.sweep.summary import Taken, read_taken, write_summary
@@ -177,6 +178,13 @@ def test_a_cell_is_refused_where_its_files_are_others(cells, tmp_path):
     with pytest.raises(InputError, match="scene.routes: other"):
         run_cell(other, tmp_path, lambda: None)
     assert not folder_of(tmp_path, other).exists()
+
+
+def test_a_cell_that_was_forced_is_not_complete(cells, tmp_path, monkeypatch):
+    monkeypatch.setattr(Job, "run_claimed", lambda self, anyway: {"flags": []})
+    with refused_at(f"{cells[0].id}", "--force", "remove the folder"):
+        run_cell(cells[0], tmp_path, lambda: None)
+    assert not is_complete(tmp_path, cells[0])
 
 
 GRID = """\

@@ -9,8 +9,9 @@ from mi_nerfattack.experiment.sweep.table import write_table
 from mi_nerfattack.experiment.transfer.best import best_attacks, chosen_runs
 
 
-def row(cell, method, seed, error, case="attack", route="right"):
+def row(cell, method, seed, error, case="attack", route="right", objects="car"):
     labels = {"cell": cell, "method": method, "seed": seed, "route": route}
+    labels["objects"] = objects
     labels |= {"environment": "surrogate", "case": case, "status": "complete"}
     figures = {"run": 0, "frames": 1, "steps": 72, "departed": False}
     return labels | figures | {"cross_track_mean_m": error, "wheel_out_s": 0.0}
@@ -35,7 +36,7 @@ def test_the_best_of_a_method_at_a_place_stands_for_it(tmp_path):
     names = [path.relative_to(tmp_path) for path in best_attacks(sweeps, 3)]
     assert [str(n) for n in names] == ["one/cells/b", "two/cells/d", "one/cells/c"]
     assert best_attacks(sweeps, 1) == [tmp_path / "one" / "cells" / "b"]
-    with pytest.raises(InputError, match="right"):
+    with pytest.raises(InputError, match="--best: 4; right has 3 attacks"):
         best_attacks(sweeps, 4)
     run = tmp_path / "run"
     assert chosen_runs([run], None) == [run]
@@ -47,3 +48,10 @@ def test_the_best_of_a_method_at_a_place_stands_for_it(tmp_path):
     ):
         with pytest.raises(InputError, match=message):
             chosen_runs(folders, best)
+
+
+def test_places_with_other_objects_count_each(tmp_path):
+    others = [row("e", "gradient", 1, 0.7, objects="cube")]
+    write_table(tmp_path, [*rows(), *others], {})
+    names = [path.name for path in best_attacks([tmp_path], 4)]
+    assert names == ["e", "b", "a", "c"]
