@@ -61,8 +61,8 @@ def repaired(drives: pd.DataFrame) -> Finding:
             "A group of attacks counts as repaired if no drive with one of them leaves "
             f"the lane, in the surrogate and in `{where}`. With the new policy, these "
             f"drives leave the lane: {', '.join(listed)}.",
-            f"In `{where}`, the error of the new policy, divided by that of the old one "
-            f"(geometric mean), is {', '.join(ratios)}.",
+            f"In `{where}`, the error of the new policy, divided by that of the old, "
+            f"is, as a geometric mean, {', '.join(ratios)}.",
             "The two aims are multiples of the error that the old policy has without "
             f"objects. The new policy has {errors[ATTACK]:.2f} times this error near "
             f"old attacks ({_aim(ATTACK, errors)}), and {errors[NO_OBJECT]:.2f} times "
