@@ -16,7 +16,7 @@ from mi_nerfattack.render.backdrop import fields_by_rays
 ATTACHED = "attached"
 _RELIT = (
     "{}: has no derivative where fields are relit, since their light is a constant; "
-    "set relit to false"
+    "set relit to false, or keep this parameter detached"
 )
 
 
@@ -127,7 +127,7 @@ def _has_effect(integrator: Any, key: str, flags: Any) -> bool:
             "Differentiate by to_world of the fields, or leave them out and use "
             "prb_projective"
         )
-    return integrator.behind is not None
+    return integrator.behind is not None or integrator.relighting is not None
 
 
 def _shared(integrator: Any, scene: mi.Scene, attached: list[Any]) -> list[str]:

@@ -125,7 +125,9 @@ class Sampled(dr.CustomOp):
     ) -> tuple[Any, mi.Bool, list[mi.Float]]:
         """Sample rays with ``call``; ``parameters`` have gradients enabled."""
         del parameters
-        self.integrator, self.call = integrator, call
+        # The backward pass replays the random numbers of this pass
+        self.integrator = integrator
+        self.call = {**call, "sampler": call["sampler"].clone()}
         with dr.suspend_grad():
             *outputs, self.state = integrator.sample(dr.ADMode.Primal, **call)
         return outputs[0], outputs[1], outputs[2]

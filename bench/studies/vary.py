@@ -126,14 +126,14 @@ def _farther(logs: Any) -> Iterator[str]:
     for name, signed in ((PLAIN, differences), (VARY, -differences)):
         counts = (signed > 0).sum()
         listed = ", ".join(
-            f"`{x}` {y} ({count} of {len(signed)} places)"
+            f"`{x}` {y} ({count} of {len(signed)})"
             for (x, y), count in counts.items()
             if is_majority(int(count), len(signed))
         )
         if listed:
             yield (
-                f"By the [rule that counts places](index.md#the-rules), `{name}` moves "
-                f"the car farther in {listed}."
+                f"The [rule that counts places](index.md#the-rules) differs: "
+                f"`{name}` moves the car farther in {listed}."
             )
 
 

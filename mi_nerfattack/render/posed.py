@@ -210,10 +210,18 @@ class PosedField:
     def background(self, direction: mi.Vector3f) -> mi.Color3f:
         """Return what lies behind the field, (3, n), linear; it turns with the field.
 
+        Differentiable by `direction`, and by `to_world` if derivatives by it are
+        asked for.
+
         Args:
             direction: (3, n), unit vectors in the world.
         """
-        _, heading = self.to_local(mi.Point3f(0), direction)
+        heading = self.turn(direction)
+        if self._attached is not None and dr.grad_enabled(self._attached.matrix):
+            # Columns of the matrix are those of the rotation, times the scale
+            m = self._attached.matrix
+            columns = [mi.Vector3f(m[0, i], m[1, i], m[2, i]) for i in range(3)]
+            heading = mi.Vector3f(*[dr.dot(column, direction) for column in columns])
         return self.field.background(dr.normalize(heading))
 
     def to_world_gradient(

@@ -118,6 +118,23 @@ def test_poses(blob, key, change, composite) -> None:
     Case(scene, key, change).check(0.5 if change == "add" else 1e-2)
 
 
+@pytest.mark.parametrize("kind", ["field_integrator", "prb"])
+def test_a_sky_turns_with_the_pose_of_its_field(tmp_path, kind) -> None:
+    ngp = small.small_ngp()
+    small.empty_border(ngp, 8)
+    save_field(tmp_path / "ngp.safetensors", ngp)
+    filename = str(tmp_path / "ngp.safetensors")
+    described = {"type": "ngp_field", "id": "ngp", "filename": filename}
+    if kind == "field_integrator":
+        scene = load({"a": described})
+    else:
+        lamp = {"type": "field_emitter", "stop": 0.0, "a": described}
+        black = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0}}
+        cube = {"type": "cube", "to_world": T().scale(8), "bsdf": black, "lamp": lamp}
+        scene = load({"type": kind, "max_depth": 2}, {"cube": cube})
+    Case(scene, "ngp.to_world", "turn").check()
+
+
 AOVS = {
     "opacity": (3, 1),
     "depth": (4, 1),

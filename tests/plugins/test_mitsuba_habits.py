@@ -209,6 +209,29 @@ def test_images_and_derivatives_through_stock_integrators(blob, kind, aovs) -> N
         np.testing.assert_allclose(part, reference, rtol=1e-3, atol=1e-6)
 
 
+def test_derivatives_inside_moment_replay_random_numbers(blob) -> None:
+    """Positions on rays and paths of several bounces are those of the image."""
+    inside = {"type": "field_integrator", "a": blob, "jitter": True}
+    inside["behind"] = {"type": "prb", "max_depth": 4}
+    grey = {"type": "rgb", "value": 0.5}
+    ball = {"type": "sphere", "center": [0, 0, -1]}
+    ball["bsdf"] = {"type": "diffuse", "reflectance": grey}
+
+    def gradient(outer: dict[str, Any]) -> float:
+        scene = load({}, {"i": outer, "sun": SUN, "floor": floor(), "ball": ball})
+        params, key = mi.traverse(scene), "ball.bsdf.reflectance.value"
+        dr.enable_grad(params[key])
+        params.update()
+        image = mi.render(scene, params, spp=4, seed=1, seed_grad=2)[..., :3]
+        dr.backward(dr.mean(image, axis=None))
+        return float(dr.sum(dr.grad(params[key]))[0])
+
+    expected = gradient(inside)
+    assert expected > 0.05
+    around = gradient({"type": "moment", "img": inside})
+    assert around == pytest.approx(expected, rel=1e-4)
+
+
 @pytest.mark.parametrize("aovs", [False, True])
 def test_channels_of_a_nested_aov_come_last(blob, aovs: bool) -> None:
     behind = {"type": "aov", "aovs": "nn:sh_normal", "img": {"type": "path"}}

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.reference.derivatives import key_of
+from support.reference.derivatives import Derivatives, images, key_of
 from support.worlds import fields as small
 from support.worlds.fields import T
 
@@ -215,6 +215,19 @@ def test_bricks_have_no_derivative_and_no_normals(volumes) -> None:
         dr.backward(dr.mean(image))
     with pytest.raises(RuntimeError, match="cannot be relit; set relit to false"):
         mi.load_dict({**volumes["brick_field"], "relit": True})
+
+
+def test_colours_beside_bricks_have_a_derivative_in_an_emitter(volumes, rng) -> None:
+    lamp = {"type": "field_emitter", "a": volumes["grid_field"]}
+    lamp["b"] = volumes["brick_field"]
+    cube = {"type": "cube", "to_world": T().scale(1.1), "emitter": lamp}
+    loaded = small.load({"type": "prb", "max_depth": 1}, {"cube": cube})
+    params = mi.traverse(loaded)
+    derivatives = Derivatives(params, key_of(params, "colour"), images(loaded, params))
+    direction = rng.normal(0, 1, derivatives.base.shape)
+    backward = float(derivatives.gradient() @ direction.ravel())
+    expected = derivatives.difference(direction, 0.05)
+    assert backward == pytest.approx(expected, rel=1e-3)
 
 
 def test_thin_parts_that_are_skipped_have_no_derivative_by_a_pose(tmp_path) -> None:

@@ -88,13 +88,18 @@ class _Render(dr.CustomOp):
         radiance, opacity = total
         cotangent = Marches(March(radiance, opacity, mi.Float(0)))
         posed, rays = self.fixed
+        layers = [
+            k
+            for k, item in enumerate(posed)
+            if item.has_gradients or item.has_pose_gradients
+        ]
         gradients = self.composite.backward_rays(
             posed,
             rays,
             self.primal,
             cotangent=cotangent,
             stop=self.stop,
-            layers=range(len(posed)),
+            layers=layers,
         )
-        for item, by_rays in zip(posed, gradients, strict=True):
-            item.backward_pose(rays, by_rays)
+        for k, by_rays in zip(layers, gradients, strict=True):
+            posed[k].backward_pose(rays, by_rays)

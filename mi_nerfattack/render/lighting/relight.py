@@ -109,9 +109,8 @@ class Relighting:
         with dr.suspend_grad():
             if has_passages(scene):  # from just before the surface that stops the ray
                 met = nearest_surface(scene, ray, active)
-                ray = mi.Ray3f(
-                    ray(dr.select(dr.isinf(met), 0, (1 - 1e-4) * met)), ray.d
-                )
+                active = active & (met < dr.inf)  # others see the sky
+                ray = mi.Ray3f(ray(dr.select(active, (1 - 1e-4) * met, 0)), ray.d)
             si = scene.ray_intersect(ray, active)
             facing = dr.dot(si.n, ray.d) < 0
             normal = dr.select(facing, mi.Vector3f(si.n), -mi.Vector3f(si.n))

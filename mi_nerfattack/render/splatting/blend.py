@@ -13,6 +13,7 @@ from mi_nerfattack.render.splatting.pairs import REACH, Lists, gather_rows, turn
 
 MAX_OPACITY = 0.9999
 WINDOW = 16  # hits of a ray that wait for one that is nearer
+_ROUNDING = 1e-5  # of an sRGB value that was decoded and encoded again
 
 
 @dataclass
@@ -226,9 +227,15 @@ def _slide(window: list[_Hit], new: _Hit) -> tuple[list[_Hit], _Hit]:
 
 
 def _develop(sums: March) -> March:
-    """Return the march of sums whose radiance is premultiplied sRGB."""
+    """Return the march of sums whose radiance is premultiplied sRGB.
+
+    A channel above 1 is cut off there, so the channel is a constant of derivatives.
+    """
     visible = sums.opacity > 0
-    colour = dr.srgb_to_linear(sums.radiance / dr.select(visible, sums.opacity, 1))
+    ratio = sums.radiance / dr.select(visible, sums.opacity, 1)
+    # `_sums_of` finds a channel that was cut off at 1, except for rounding
+    ratio = dr.select(ratio < 1 - _ROUNDING, ratio, dr.detach(ratio))
+    colour = dr.srgb_to_linear(ratio)
     return March(sums.opacity * colour, sums.opacity, sums.moment)
 
 

@@ -2,9 +2,10 @@
 
 A chart is a pinhole view: a ray whose direction is (x, y, z) in the frame of the chart
 stands at (x / z, y / z). Rays of one origin that keep within 66 degrees of their mean
-direction share a chart; others are spread over the six faces of a cube around it. Each
-chart is cut into square cells of few rays, so that what may meet a ray is found cell
-by cell, whatever the lens, the order of the rays and their number per pixel.
+direction share a chart; others are spread over the six faces of a cube around it. If
+rays start on the near clips of cameras, each camera counts as one origin. Each chart is
+cut into square cells of few rays, so that what may meet a ray is found cell by cell,
+whatever the lens, the order of the rays and their number per pixel.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from mi_nerfattack.render.rays import pick_rays
 PER_CELL = 16  # rays, where cells are neither at their smallest nor at their largest
 LEAST, LARGEST = 0.004, 0.015  # edge of a cell, tangent of an angle
 ORIGINS = 64  # of the rays; with more of them, all rays share a chart
+APART_M = 0.05  # between neighbours that are rays of two cameras, metres
 NARROW = 0.4  # least cosine to the mean direction of rays that share a chart
 _MARGIN = 1e-6  # around the rays of a chart
 _SIGN = 1 << 31
@@ -155,14 +157,32 @@ def _origins(origin: mi.Point3f, count: int) -> tuple[mi.Point3f, mi.UInt32, mi.
         return origin, dr.zeros(mi.UInt32, count), none
     index = dr.arange(mi.UInt32, count)
     before = dr.gather(mi.Point3f, origin, dr.maximum(index, 1) - 1)
+    # Rays that start at one point share a view
     changes = dr.any(origin != before)
     starts = dr.compress(changes | (index == 0))
     if dr.width(starts) <= ORIGINS:
-        view = dr.cumsum(dr.select(changes, mi.UInt32(1), mi.UInt32(0)))
-        return dr.gather(mi.Point3f, origin, starts), view, none
-    weight = dr.rcp(dr.opaque(mi.Float, count))
-    middle = mi.Point3f(*(dr.sum(x) * weight for x in origin))
-    return middle, dr.zeros(mi.UInt32, count), dr.max(dr.norm(origin - middle))
+        return dr.gather(mi.Point3f, origin, starts), _numbered(changes), none
+    # Else rays of one camera, which start on its near clip; else all rays
+    changes = dr.squared_norm(origin - before) > APART_M**2
+    starts = dr.compress(changes | (index == 0))
+    if dr.width(starts) > ORIGINS:
+        changes, starts = dr.zeros(mi.Bool, count), dr.opaque(mi.UInt32, 0)
+    view = _numbered(changes)
+    first = dr.gather(mi.Point3f, origin, starts)
+    # Their mean, from sums of small numbers, which round little
+    offset = mi.Vector3f(origin - dr.gather(mi.Point3f, first, view))
+    total = dr.zeros(mi.Vector3f, dr.width(starts))
+    rays = dr.zeros(mi.Float, dr.width(starts))
+    dr.scatter_reduce(dr.ReduceOp.Add, total, offset, view)
+    dr.scatter_reduce(dr.ReduceOp.Add, rays, mi.Float(1), view)
+    middle = mi.Point3f(first + total / rays)
+    away = dr.norm(origin - dr.gather(mi.Point3f, middle, view))
+    return middle, view, dr.max(away)
+
+
+def _numbered(changes: mi.Bool) -> mi.UInt32:
+    """Return the number of changes up to each ray, (n,)."""
+    return dr.cumsum(dr.select(changes, mi.UInt32(1), mi.UInt32(0)))
 
 
 def _frames(direction: mi.Vector3f, view: mi.UInt32, count: int) -> list[mi.Vector3f]:

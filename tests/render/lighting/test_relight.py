@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -209,6 +210,20 @@ def test_lights_and_sky_behind_are_not_shaded(box) -> None:
     np.testing.assert_allclose(colour(loaded), 2, rtol=1e-5)
 
 
+@pytest.mark.parametrize("bsdf", ["null", "thindielectric", "mask"])
+def test_the_sky_behind_what_is_invisible_is_not_shaded(box, bsdf: str) -> None:
+    hovering = {**box, "to_world": T().translate([0, 0, 4])}
+    seeing = {"object": hovering, "behind": {"type": "path"}}
+    pane: dict[str, Any] = {"type": "rectangle", "to_world": T().scale(3)}
+    pane["bsdf"] = {"type": bsdf}
+    if bsdf == "mask":
+        pane["bsdf"] |= {"opacity": 0.0, "nested": {"type": "diffuse"}}
+    if bsdf == "thindielectric":
+        pane["bsdf"]["int_ior"] = 1.0  # without a reflection
+    loaded = scene(seeing, (0, -6, 3.0), pane=pane, sky=sky(2.0), sun=sun(0, 0, -1))
+    np.testing.assert_allclose(colour(loaded), 2, rtol=1e-5)
+
+
 # Surfaces of fields
 
 
@@ -317,3 +332,15 @@ def test_what_changes_the_light_is_refused(tmp_path: Path, rng, name: str) -> No
     derivatives = problem(tmp_path, rng, name, "interleaved")
     with pytest.raises(Exception, match="set relit to false"):
         derivatives.gradient()
+
+
+def test_a_light_is_refused_without_a_nested_integrator(box) -> None:
+    lamp = {"type": "point", "position": [9.0, 0.0, 0.0]}
+    loaded = scene({"object": box}, lamp=lamp)
+    params = mi.traverse(loaded)
+    key = key_of(params, "intensity.value")
+    dr.enable_grad(params[key])
+    params.update()
+    image = mi.render(loaded, params, spp=1)
+    with pytest.raises(InputError, match="^lamp.* this parameter detached"):
+        dr.backward(dr.mean(image, axis=None))
