@@ -105,8 +105,8 @@ def light(drives: pd.DataFrame) -> Finding:
             "before the first result.",
             "In `mujoco`, another model moves the car: it stands on wheels, and its "
             "steering lags.",
-            "All rows have the same attacks, so the rows are not independent. Light of "
-            "the scene falls on the objects in the `built_in` rows only.",
+            "All rows have the same attacks, so the rows are not independent. The "
+            "light of the scene falls on the objects in the `built_in` rows only.",
             *_farther(logs),
             _stayed(drives, log_shares),
         ),
