@@ -209,7 +209,11 @@ def flat(drives: pd.DataFrame) -> Finding:
     ends = share_interval(out, all_places)
     missing = 2 * (FLAT_PLACES - all_places)  # two drives at each
     most = (left[ATTACK] + missing) / (count[ATTACK] + missing)
-    lost = f" At most {100 * most:.0f} % are possible now, so we missed this aim."
+    lost = (
+        " We missed this aim."
+        if not missing
+        else (f" At most {100 * most:.0f} % are possible now, so we missed this aim.")
+    )
     percent = f"{100 * shares[CASES[ATTACK]]:.0f} %"
     title = f"Flat objects send the car out of its lane in {percent} of the drives"
     kinds = summary(own, ["objects", "case"], ["cell"])
@@ -218,7 +222,7 @@ def flat(drives: pd.DataFrame) -> Finding:
         sentences=(
             f"With the attack, {left[ATTACK]} of {count[ATTACK]} drives leave the lane "
             "in the path-traced scene, where its sun and sky light the object. "
-            f"They are at {out} of {all_places} places (share of the places: "
+            f"The drives that leave it are at {out} of {all_places} places (share: "
             f"{interval_words(ends, 2)}).",
             f"With random textures, {left[RANDOM]} of {count[RANDOM]} drives leave the "
             "lane.",

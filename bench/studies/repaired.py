@@ -64,7 +64,8 @@ def repaired(drives: pd.DataFrame) -> Finding:
             f"In `{where}`, the error of the new policy, divided by that of the old, "
             f"is, as a geometric mean, {', '.join(ratios)}.",
             "The two aims are multiples of the error that the old policy has without "
-            f"objects. The new policy has {errors[ATTACK]:.2f} times this error near "
+            "objects. In the environment with the larger multiple, the new policy has "
+            f"{errors[ATTACK]:.2f} times this error near "
             f"old attacks ({_aim(ATTACK, errors)}), and {errors[NO_OBJECT]:.2f} times "
             f"this error without objects ({_aim(NO_OBJECT, errors)}).",
         ),
@@ -85,8 +86,9 @@ def repaired(drives: pd.DataFrame) -> Finding:
         'rows = ["group", "environment"]\n'
         'print(own.pivot_table("cross_track_mean_m", rows, "policy"))',
         threats=(
-            "Old attacks know the old policy, and adaptive attacks know the new one. "
-            "Both have equal places and budgets.",
+            "In the rows of adaptive attacks, 'before' is the old policy near the old "
+            "attacks, and 'after' is the new policy near the new attacks. Both have "
+            "equal places and budgets.",
         ),
     )
 

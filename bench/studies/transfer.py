@@ -93,9 +93,8 @@ def _size(drives: pd.DataFrame) -> str:
     left = by_day.groupby("environment", sort=False)["departed"].sum()
     counts = ", ".join(f"`{name}` {count}" for name, count in left.items())
     return (
-        f"Most of these attacks are weak: the median error in the surrogate is "
-        f"{own[ERROR].median():.2f} m. Of {len(own)} drives by day, these leave the "
-        f"lane: {counts}."
+        f"The median error in the surrogate is {own[ERROR].median():.2f} m by day. Of "
+        f"the {len(own)} drives in each environment, these leave the lane: {counts}."
     )
 
 

@@ -93,7 +93,10 @@ def light(drives: pd.DataFrame) -> Finding:
         ),
         head=[
             *("environment", "condition", "`vary` keeps", "95 % interval", "aim"),
-            *("`plain` keeps", "without objects, by the surrogate's error with `vary`"),
+            *(
+                "`plain` keeps",
+                "without objects, divided by the surrogate's error with `vary`",
+            ),
             "error of `vary`, divided by that of `plain`, 95 % interval",
         ],
         rows=rows,

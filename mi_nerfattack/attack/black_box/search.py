@@ -116,6 +116,8 @@ class BlackBoxAttack:
         asked = self.search.ask()
         judged = self.judge(asked.textures, on_step)
         judged = replace(judged, objective=judged.objective + asked.penalty)
+        if not np.isfinite(judged.objective):
+            raise InputError(f"objective: {judged.objective}; check the judge for NaN")
         self._take(asked, judged)
         return judged
 

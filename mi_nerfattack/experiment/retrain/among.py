@@ -317,7 +317,6 @@ class FramesAmong:
 
     @property
     def routes(self) -> list[Route]:
-        """Routes of the attacks, each once."""
-        return list(
-            {attack.route.name: attack.route for attack in self.attacks}.values()
-        )
+        """Routes of the attacks, each once, by their names."""
+        named = {attack.route.name: attack.route for attack in self.attacks}
+        return [named[name] for name in sorted(named)]

@@ -278,7 +278,7 @@ def train_once(
             the training fails, or writes nothing that can be used.
     """
     asked = {path.resolve() for path in shards}
-    if others := set(order.data.rglob(SHARDS)) - asked:
+    if others := {path.resolve() for path in order.data.rglob(SHARDS)} - asked:
         raise InputError(
             f"{min(others)}: is of other --frames, and the training would read it; "
             "choose another --data, or remove the file"

@@ -196,6 +196,10 @@ def test_penalties_count(monkeypatch):
     assert attack.step().objective > 5
 
 
+def nowhere(textures, on_step=None):
+    return Judged(float("nan"), 0.0, 0.0, 4)
+
+
 @pytest.mark.parametrize(
     ("work", "message"),
     [
@@ -218,6 +222,10 @@ def test_penalties_count(monkeypatch):
                 make("blocks", f), ColourJudge(f), 5
             ).load_tensors({"history": np.zeros((2, 3))}),
             "history: shape",
+        ),
+        (
+            lambda c, f: BlackBoxAttack(make("blocks", f), nowhere, 8).step(),
+            "objective: nan",
         ),
     ],
 )
