@@ -167,12 +167,12 @@ def _threats_to_attack(
     means, others = (by_place(one) for one in (own, random))
     far = means.idxmax()
     drives = own.set_index(["scenario", "seed"]).loc[[far]][ERROR]
-    rest, least = means.drop(far).mean(), others.drop(far).mean()
+    mean_m, random_m = means.drop(far).mean(), others.drop(far).mean()
     yield (
         f"One place, {place_name(far)}, has a mean error of {means[far]:.2f} m: "
         f"{' and '.join(f'{error:.2f}' for error in drives)} m from its starts. Over "
-        f"the other places, the means are {rest:.2f} m with the attack and "
-        f"{least:.2f} m with the worst random texture (ratio {rest / least:.1f})."
+        f"the other places, the means are {mean_m:.2f} m with the attack and "
+        f"{random_m:.2f} m with the worst random texture (ratio {mean_m / random_m:.1f})."
     )
 
 

@@ -162,8 +162,8 @@ def _aim(case: str, errors: dict[str, float]) -> str:
 def _title(is_repaired: dict[str, bool]) -> str:
     """Return the title; by group, whether no drive leaves the lane."""
     good, bad = (
-        _listed([GROUPS[g] for g, is_good in is_repaired.items() if is_good == wanted])
-        for wanted in (True, False)
+        _listed([GROUPS[g] for g, is_good in is_repaired.items() if is_good == side])
+        for side in (True, False)
     )
     if not good:
         return "Retraining does not repair the policy against any group of attacks"

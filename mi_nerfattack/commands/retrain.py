@@ -43,8 +43,8 @@ class Retrain:
     older frames (--more), or lets --command train it. Then drives again. Only runs
     count whose scenario the expert itself can drive. Stopped, it continues from DATA.
     With more --held-out or --adaptive it continues without training again. Next to the
-    policy it writes NAME-retrain.json, with the errors before and after, and their
-    drives in NAME-retrain.csv. Its own training also writes program and record.
+    policy, NAME-retrain.json has the errors before and after, and NAME-retrain.csv the
+    drives. Its own training also writes program and record.
     """
 
     continues: ClassVar[bool] = True

@@ -177,13 +177,16 @@ def test_what_makes_no_sense_is_refused(closed):
     rollout, initial, _ = closed
     attached = replace(rollout.open_loop(initial), attached=True)
     evaluation = attached.run(initial)
-    kept = replace(rollout, adjoint=KeptBackgrounds())
+    keeping = replace(rollout, adjoint=KeptBackgrounds())
     measured = rollout.measure(initial).trajectory
     for call, message in (
         (lambda: rollout.open_loop(initial, HORIZON), "frame: 6; .* 6"),
         (lambda: attached.gradient(evaluation), "attached to false"),
         (lambda: attached.by_images(evaluation.trajectory, {1}), "attached to false"),
-        (lambda: kept.by_images(kept.run(initial).trajectory, {1}), r"=Replay\(\)"),
+        (
+            lambda: keeping.by_images(keeping.run(initial).trajectory, {1}),
+            r"=Replay\(\)",
+        ),
         (lambda: rollout.by_images(measured, {1}), r"a drive of run\(\)"),
     ):
         with pytest.raises(InputError, match=message):
