@@ -172,7 +172,8 @@ def _threats_to_attack(
         f"One place, {place_name(far)}, has a mean error of {means[far]:.2f} m: "
         f"{' and '.join(f'{error:.2f}' for error in drives)} m from its starts. Over "
         f"the other places, the means are {mean_m:.2f} m with the attack and "
-        f"{random_m:.2f} m with the worst random texture (ratio {mean_m / random_m:.1f})."
+        f"{random_m:.2f} m with the worst random texture (ratio "
+        f"{mean_m / random_m:.1f})."
     )
 
 
