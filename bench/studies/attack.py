@@ -165,7 +165,7 @@ def _threats_to_attack(
         f"the mean errors: {counts}."
     )
     means, others = (by_place(one) for one in (own, random))
-    far = means.idxmax()
+    far: Any = means.idxmax()
     drives = own.set_index(["scenario", "seed"]).loc[[far]][ERROR]
     mean_m, random_m = means.drop(far).mean(), others.drop(far).mean()
     yield (

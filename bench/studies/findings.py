@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import pandas as pd
 
@@ -269,7 +270,8 @@ def _by_environment(drives: pd.DataFrame) -> str:
 
 def _routes(own: pd.DataFrame) -> str:
     """Say how many places of each kind and route the rows have."""
-    places = own.groupby(["objects", "route"], sort=False)["cell"].nunique()
+    by = ["objects", "route"]
+    places: Any = own.groupby(by, sort=False)["cell"].nunique()
     counts = ", ".join(
         f"{kind} on `{route}` {count}" for (kind, route), count in places.items()
     )
