@@ -36,6 +36,13 @@ GROUPS = {OLD: "old", HELD_OUT: "held-out", ADAPTIVE: "adaptive"}
 AIMS = {ATTACK: 1.2, NO_OBJECT: 1.1}
 
 
+_ADAPTIVE = (
+    "In the rows of adaptive attacks, 'before' is the old policy near the old attacks, "
+    "and 'after' is the new policy near the new attacks. Both have equal places and "
+    "budgets."
+)
+
+
 def repaired(drives: pd.DataFrame) -> Finding:
     """Compare drives of the policy before and after the retraining, paired by place.
 
@@ -50,7 +57,7 @@ def repaired(drives: pd.DataFrame) -> Finding:
     counts = {g: sum(compared[g, e].drives for e in worlds) for g in groups}
     listed = (f"{left[g]} of {counts[g]} ({name})" for g, name in groups.items())
     ratios = (
-        f"{one.ratio:.2f} near {name} attacks ({interval_words(one.ends, 2)})"
+        f"It is {one.ratio:.2f} near {name} attacks ({interval_words(one.ends, 2)})."
         for g, name in groups.items()
         for one in [compared[g, where]]
     )
@@ -61,13 +68,13 @@ def repaired(drives: pd.DataFrame) -> Finding:
             "A group of attacks counts as repaired if no drive with one of them leaves "
             f"the lane, in the surrogate and in `{where}`. With the new policy, these "
             f"drives leave the lane: {', '.join(listed)}.",
-            f"In `{where}`, the error of the new policy, divided by that of the old, "
-            f"is, as a geometric mean, {', '.join(ratios)}.",
+            f"The ratio is the error of the new policy in `{where}`, divided by the "
+            f"error of the old one (geometric mean). {' '.join(ratios)}",
             "The two aims are multiples of the error that the old policy has without "
-            "objects. In the environment with the larger multiple, the new policy has "
-            f"{errors[ATTACK]:.2f} times this error near "
-            f"old attacks ({_aim(ATTACK, errors)}), and {errors[NO_OBJECT]:.2f} times "
-            f"this error without objects ({_aim(NO_OBJECT, errors)}).",
+            f"objects. Near old attacks, the new policy has {errors[ATTACK]:.2f} times "
+            f"this error in the worse environment ({_aim(ATTACK, errors)}). Without "
+            f"objects, it has {errors[NO_OBJECT]:.2f} times this error "
+            f"({_aim(NO_OBJECT, errors)}).",
         ),
         head=[
             *("attacks", "environment", "number", "error before (m)", "after (m)"),
@@ -83,13 +90,8 @@ def repaired(drives: pd.DataFrame) -> Finding:
             {f"{GROUPS[g]}, {e}": (x.ratio, x.ends) for (g, e), x in compared.items()},
         ),
         pandas="own = drives.query(\"case == 'attack'\")\n"
-        'rows = ["group", "environment"]\n'
-        'print(own.pivot_table("cross_track_mean_m", rows, "policy"))',
-        threats=(
-            "In the rows of adaptive attacks, 'before' is the old policy near the old "
-            "attacks, and 'after' is the new policy near the new attacks. Both have "
-            "equal places and budgets.",
-        ),
+        'print(own.groupby(["group", "environment", "policy"]).departed.mean())',
+        threats=(_ADAPTIVE,) if ADAPTIVE in groups else (),
     )
 
 

@@ -291,9 +291,9 @@ def test_a_policy_is_repaired_where_no_drive_leaves_the_lane():
     left = "0 of 10 (old), 0 of 10 (held-out), 10 of 10 (adaptive)."
     assert answer.sentences[0].endswith(left)
     _, errors, aims = answer.sentences
-    assert "0.25 near old" in errors and "0.75 near adaptive" in errors
-    assert "0.25 times this error near old attacks (reaches" in aims
-    assert "1.10 times this error without objects (reaches" in aims
+    assert "It is 0.25 near old" in errors and "It is 0.75 near adaptive" in errors
+    assert "has 0.25 times this error in the worse environment (reaches" in aims
+    assert "it has 1.10 times this error (reaches" in aims
     assert answer.rows[5] == [
         *("adaptive", "`mitsuba`", "5", "3.000", "2.250", "0.75", "0.75 to 0.75"),
         *("5/5", "5/5"),
