@@ -64,7 +64,7 @@ SKIPPED = {
     "results/findings/index": LONG,
     **{f"car/{x}": CAR for x in "compare drive monitor motor overlay".split()},
     **{f"car/{x}": CAR for x in "print remote setup".split()},
-    **dict.fromkeys("results/car results/retrain".split(), LONG),
+    "results/car": LONG,
     "howto/carla": "takes CARLA's server",
     "reference/commands": "writes into the home folder",
     "start/first_attack": LONG,
