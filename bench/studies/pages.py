@@ -98,7 +98,7 @@ def page_text(study: Study, made: Finding, one: State, picture: str) -> str:
     threats = [f"The table has {one.done} of {one.wanted} {study.units}."]
     if UNKNOWN in one.sources:
         threats.append(
-            "Nobody recorded which commit of the source made these rows, so today's "
+            "Nobody recorded which commit of the source made these rows. Today's "
             f"program may give other figures (`make results LIST=1 ONLY={study.name}`)."
         )
     if len(one.sources) > 1:

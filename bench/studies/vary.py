@@ -44,6 +44,21 @@ VARIATIONS = {
 }
 
 
+_OF_LIGHT = (
+    "The aim is the least share that `vary` should keep. We set the aims before the "
+    "first result.",
+    "In `mujoco`, another model moves the car: it stands on wheels, and its steering "
+    "lags.",
+    "All rows have the same attacks, so the rows are not independent. The light of the "
+    "scene falls on the objects in the `built_in` rows only.",
+)
+_HEAD_OF_LIGHT = (
+    *("environment", "condition", "`vary` keeps", "95 % interval", "aim"),
+    *("`plain` keeps", "without objects, divided by the surrogate's error with `vary`"),
+    "error of `vary`, divided by that of `plain`, 95 % interval",
+)
+
+
 def light(drives: pd.DataFrame) -> Finding:
     """Compare attacks with and without `vary`, in each environment and condition."""
     logs, without = (
@@ -91,28 +106,12 @@ def light(drives: pd.DataFrame) -> Finding:
             if gains
             else "No place has an attack of both kinds, so the last column is empty.",
         ),
-        head=[
-            *("environment", "condition", "`vary` keeps", "95 % interval", "aim"),
-            *(
-                "`plain` keeps",
-                "without objects, divided by the surrogate's error with `vary`",
-            ),
-            "error of `vary`, divided by that of `plain`, 95 % interval",
-        ],
+        head=_HEAD_OF_LIGHT,
         rows=rows,
         draw=lambda figure: draw_heat(figure, heat),
         pandas="own = drives.query(\"case == 'attack'\")\n"
         'print(own.pivot_table("cross_track_mean_m", "environment", "condition"))',
-        threats=(
-            "The aim is the least share that `vary` should keep. We set the aims "
-            "before the first result.",
-            "In `mujoco`, another model moves the car: it stands on wheels, and its "
-            "steering lags.",
-            "All rows have the same attacks, so the rows are not independent. The "
-            "light of the scene falls on the objects in the `built_in` rows only.",
-            *_farther(logs),
-            _stayed(drives, log_shares),
-        ),
+        threats=(*_OF_LIGHT, *_farther(logs), _stayed(drives, log_shares)),
     )
 
 
