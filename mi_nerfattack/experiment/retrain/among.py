@@ -17,7 +17,6 @@ from mi_nerfattack.deploy.environment import (
 from mi_nerfattack.deploy.place import Place
 from mi_nerfattack.deploy.sites import AbstractSite
 from mi_nerfattack.deploy.vehicle import Controls
-from mi_nerfattack.drives.spec import short_digest
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.run_folder import object_path
 from mi_nerfattack.experiment.transfer.found import FoundAttack
@@ -65,8 +64,7 @@ class AmongFound(AbstractStaging):
 
     def identity(self) -> dict[str, str]:
         """Return digests of what was found, and of its scenarios."""
-        runs = [_content(attack) for attack in self._sorted]
-        return flatten("staging.found", runs)
+        return flatten("staging.found", [attack.content for attack in self._sorted])
 
     def open(
         self, site: AbstractSite, routes: Sequence[Route], settings: CollectSettings
@@ -78,12 +76,7 @@ class AmongFound(AbstractStaging):
     @property
     def _sorted(self) -> list[FoundAttack]:
         """The attacks in an order that does not depend on how they were given."""
-        return sorted(self.attacks, key=_content)
-
-
-def _content(attack: FoundAttack) -> tuple[str, str]:
-    """Return digests of what was found, and of its scenario."""
-    return attack.digest, short_digest(attack.identity)
+        return sorted(self.attacks, key=lambda attack: attack.content)
 
 
 class _FoundStage(AbstractStage):

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from mi_nerfattack.drives.spec import short_digest
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.baseline import RandomAppearances
 from mi_nerfattack.experiment.run_folder import (
@@ -67,6 +68,11 @@ class FoundAttack:
     identity: Mapping[str, str]
     digest: str
     surrogate: Mapping[str, Any]
+
+    @property
+    def content(self) -> tuple[str, str]:
+        """Digests of what was found, and of its scenario."""
+        return self.digest, short_digest(self.identity)
 
     @property
     def horizon(self) -> int:
@@ -150,10 +156,9 @@ def read_found(folders: Sequence[Path]) -> tuple[FoundAttack, ...]:
         raise InputError("RUN: at least one run folder, each once")
     pairs = zip(folders, folder_labels(folders), strict=True)
     attacks = tuple(_read(Path(path), label) for path, label in pairs)
-    first: dict[str, FoundAttack] = {}
+    first: dict[tuple[str, str], FoundAttack] = {}
     for attack in attacks:
-        content = json_digest([attack.digest, dict(attack.identity)])
-        if (other := first.setdefault(content, attack)) is not attack:
+        if (other := first.setdefault(attack.content, attack)) is not attack:
             raise InputError(
                 f"{attack.folder}: is a copy of {other.folder}; give each run once"
             )
