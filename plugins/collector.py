@@ -121,6 +121,7 @@ class FrozenComposite:
         Args:
             rays: n rays, without literals.
         """
+        # Layers that are marched before the recording; None for those inside it
         _, posed, stop = self._arguments
         layers: list[March | None] = []
         for k, layer in enumerate(posed):

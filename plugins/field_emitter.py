@@ -124,6 +124,7 @@ class FieldEmitter(mi.Emitter):
 
     def eval(self, si: mi.SurfaceInteraction3f, active: Mask = True) -> Any:
         """Evaluate the radiance that leaves towards ``si.wi``, (channels, n)."""
+        # From inside, rays end on the surface; from outside, they start there
         direction = -si.to_world(si.wi)
         inside = dr.dot(direction, si.n) > 0
         origin = dr.select(inside, si.p - si.t * direction, si.p)
@@ -131,6 +132,7 @@ class FieldEmitter(mi.Emitter):
         rays = Rays(
             origin, direction, t_max, jitter=mi.Float(0.5), active=mi.Bool(active)
         )
+        # The fields, and what they let through of the sky behind them
         posed = [volume.posed for volume in self.volumes]
         radiance, opacity = attached(self.composite, posed, rays, stop=self.stop)
         radiance += (1 - opacity) * background(self.volumes, direction)
