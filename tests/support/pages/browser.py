@@ -111,15 +111,18 @@ def browser(folder, size=(1400, 900)):
         [program, *words, "about:blank"], stderr=subprocess.DEVNULL
     )
     try:
-        ready = profile / "DevToolsActivePort"
-        wait_for(ready.exists)
-        port = ready.read_text().split()[0]
-        tab = _tab(port)
+        tab = _tab(_port(profile / "DevToolsActivePort"))
         with connect(tab, max_size=None, proxy=None, ping_interval=None) as socket:
             yield Page(socket)
     finally:
         child.terminate()
         child.wait(timeout=30)
+
+
+def _port(path):
+    """Return the browser's port, when its file is there and its first line complete."""
+    wait_for(lambda: path.exists() and "\n" in path.read_text())
+    return path.read_text().split()[0]
 
 
 def _tab(port):
