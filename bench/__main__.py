@@ -8,6 +8,7 @@ from bench.accuracy import BenchAccuracy
 from bench.attack.bench import BenchAttack
 from bench.attack.scaling import BenchScaling
 from bench.capture import BenchGaps, BenchPoses
+from bench.end_to_end import BenchEndToEnd
 from bench.fit.bench import BenchFit
 from bench.gpu import BenchFrames, BenchGpu
 from bench.loop.bench import BenchLoop
@@ -25,6 +26,7 @@ COMMANDS = {
     "attack": BenchAttack,
     "scaling": BenchScaling,
     "loop": BenchLoop,
+    "end_to_end": BenchEndToEnd,
     "splats": BenchSplats,
     "accuracy": BenchAccuracy,
     "vary": BenchVary,

@@ -5,10 +5,12 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import sys
 from typing import get_type_hints
 
 import pytest
 
+from bench import end_to_end
 from bench.__main__ import COMMANDS, main
 from bench.attack import bench as attack
 from bench.attack import scaling
@@ -118,3 +120,57 @@ def test_scaling_is_written_row_by_row_and_goes_on(capsys, monkeypatch, tmp_path
     assert powers.keys() == {"pixels", "poses"}  # none of one size
     assert powers["pixels"]["iteration_ms"] == pytest.approx(1)
     assert powers["poses"]["iteration_mb"] == pytest.approx(0.5)
+
+
+class TestEndToEnd:
+    """Whole commands of two checkouts, which here only note what they were asked."""
+
+    @pytest.fixture
+    def checkout(self, tmp_path, monkeypatch):
+        other = tmp_path / "other"
+        (other / ".venv/bin").mkdir(parents=True)
+        (other / ".venv/bin/python").symlink_to(sys.executable)
+        (other / "mi_nerfattack").mkdir()
+        script = "import sys; open('asked', 'a').write(' '.join(sys.argv[1:]) + '\\n')"
+        (other / "mi_nerfattack/cli.py").write_text(script)
+        (other / "scenes").mkdir()
+        (other / "scenes/demo.toml").write_text("[drive]\nruns = 4\n")
+        monkeypatch.setenv("NERFATTACK_DATA", "data")
+        words = {"list": "capture scene --help", "attack": "attack --help"}
+        monkeypatch.setattr(end_to_end, "COMMANDS", words)
+        return other
+
+    def test_turns_are_timed_once(self, checkout, tmp_path, capsys):
+        path = tmp_path / "times"
+        words = ["end_to_end", "-o", str(path), "--other", str(checkout), "--former"]
+        assert main([*words, "--repeats", "1"]) == 0
+        assert capsys.readouterr().out.count("|\n") == 4
+        assert main([*words, "--repeats", "2", "--json"]) == 0
+        rows = json.loads(capsys.readouterr().out)["rows"]
+        order = [(row["round"], row["checkout"], row["command"]) for row in rows]
+        expected = [
+            (turn, name, command)
+            for turn in (0, 1)
+            for command in ("list", "attack")
+            for name in ("this", "other")
+        ]
+        assert order == expected
+        assert all(row["seconds"] > 0 and row["peak_mb"] > 5 for row in rows)
+        asked = (checkout / "asked").read_text().splitlines()
+        assert asked == ["capture --help", "attack --help"] * 2
+        assert "runs = 2" in (path / "other-1/short.toml").read_text()
+
+    def test_leftovers_go_and_failures_end_it(self, checkout, tmp_path, monkeypatch):
+        words = {"fit": "fit nothing -o {work}/field.safetensors"}
+        monkeypatch.setattr(end_to_end, "COMMANDS", words)
+        path = tmp_path / "times"
+        (path / "this-0/field.report").mkdir(parents=True)
+        with pytest.raises(SystemExit):
+            main(["end_to_end", "-o", str(path), "--repeats", "1"])
+        assert not (path / "this-0/field.report").exists()
+        assert "nothing" in (path / "this-0/log.txt").read_text()
+
+    def test_data_are_asked_for(self, monkeypatch, tmp_path, capsys):
+        monkeypatch.delenv("NERFATTACK_DATA", raising=False)
+        assert main(["end_to_end", "-o", str(tmp_path)]) == cli.EXIT_INPUT
+        assert "NERFATTACK_DATA is not set" in capsys.readouterr().err
