@@ -6,7 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.ranges import Acute, CarUnit, Name, Negative, Positive, checked
+from mi_nerfattack.ranges import (
+    Acute,
+    CarUnit,
+    Name,
+    Negative,
+    NonNegative,
+    Positive,
+    checked,
+)
 from mi_nerfattack.render.camera.intrinsics import CameraMount
 
 
@@ -53,7 +61,7 @@ def acceleration_of(controls: Sequence[Control]) -> tuple[float, float] | None:
 @dataclass(frozen=True)
 @checked("car")
 class Car:
-    """A car with front-wheel steering; its state refers to the middle of the rear axle.
+    """A car with front-wheel steering; its state refers to a point on its middle line.
 
     Args:
         wheelbase: between the axles, metres.
@@ -68,6 +76,8 @@ class Car:
         max_control: largest control that has an effect, in that unit; of a steering
             angle at most `max_steer`.
         more_controls: those that it takes after this one.
+        reference: how far ahead of the rear axle this point is, metres; a centre of
+            gravity for some models.
     """
 
     wheelbase: Positive = 2.7
@@ -80,6 +90,7 @@ class Car:
     control_unit: CarUnit = "rad/s"
     max_control: Positive = 1.5
     more_controls: tuple[Control, ...] = ()
+    reference: NonNegative = 0.0
 
     @property
     def control_names(self) -> tuple[str, ...]:

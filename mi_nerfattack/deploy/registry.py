@@ -103,7 +103,7 @@ def _carla(place: Place, conditions: Conditions) -> AbstractEnvironment:
     _refuse_built_in("carla", conditions)
     _refuse_disturbed("carla", conditions)
     server = CarlaServer.parse(place.server, weather=_CARLA_WEATHER[conditions.sky])
-    driver = KinematicDriver(kinematic_vehicle(place))
+    driver = KinematicDriver(kinematic_vehicle(place), place.car.reference)
     exposure = {"exposure_compensation": str(conditions.exposure_ev)}
     return CarlaEnvironment(
         server,

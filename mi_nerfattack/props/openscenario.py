@@ -79,11 +79,11 @@ def _scenario(
 ) -> Element:
     """Return the document; objects are id, pose and vertices (n, 3) in metres."""
     scenario, route = attack.scenario, attack.route
-    start = _worst_start(attack)
-    entities = [
-        _node("ScenarioObject", _car(scenario.vehicle.car(), route), name="ego")
-    ]
-    actions = [_ego(start, route)]
+    start, car = _worst_start(attack), scenario.vehicle.car()
+    # The origin of a vehicle in OpenSCENARIO is the middle of its rear axle.
+    axle = start - car.reference * np.array([np.cos(start[2]), np.sin(start[2]), 0])
+    entities = [_node("ScenarioObject", _car(car, route), name="ego")]
+    actions = [_ego(axle, route)]
     for name, pose, vertices in objects:
         low, high = vertices.min(0), vertices.max(0)
         body = _node(

@@ -204,13 +204,13 @@ class BicycleSection(AbstractVehicleSection):
 
     def build(self) -> AbstractDynamics:
         """Make the model."""
+        front, rear = self.front_axle_m, self.rear_axle_m
         steer = float(np.radians(self.max_steer_deg))
-        return KinematicBicycle(
-            self.speed_ms, self.front_axle_m, self.rear_axle_m, steer
-        )
+        return KinematicBicycle(self.speed_ms, front, rear, steer)
 
     def handling(self) -> dict[str, Any]:
-        return _steered(self.front_axle_m + self.rear_axle_m, self.max_steer_deg)
+        wheelbase, rear = self.front_axle_m + self.rear_axle_m, self.rear_axle_m
+        return _steered(wheelbase, self.max_steer_deg) | {"reference": rear}
 
 
 class AbstractSingleTrackSection(AbstractVehicleSection):
@@ -298,7 +298,7 @@ class DynamicSingleTrackSection(AbstractSingleTrackSection):
 
     def handling(self) -> dict[str, Any]:
         handling = self._accelerated(self.front_axle_m + self.rear_axle_m)
-        return handling | {"mass": self.mass_kg}
+        return handling | {"mass": self.mass_kg, "reference": self.rear_axle_m}
 
 
 class CustomSection(AbstractVehicleSection):

@@ -27,10 +27,12 @@ from mi_nerfattack.experiment.transfer.found import read_found
 from mi_nerfattack.fields import save_field
 from mi_nerfattack.io import files
 from mi_nerfattack.io.video import open_video, write_video
-from mi_nerfattack.props import attacked
+from mi_nerfattack.props import attacked, openscenario
 from mi_nerfattack.props.attacked import FACES, Views, read_box, seen_most
 from mi_nerfattack.props.follow import FollowServer
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov, look_at
+from mi_nerfattack.scenario.section import read_section
+from mi_nerfattack.scenario.vehicle import VehicleSection
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -303,3 +305,24 @@ def test_another_reader_finds_car_object_and_route(run, exported):
     offset, width = road.find("lanes/laneOffset"), road.find(".//right/lane/width")
     lane, shift = float(width.get("a")), float(offset.get("a"))
     assert lane == attack.route.lane_width_m and shift - lane / 2 == 0
+
+
+def test_the_car_stands_on_its_rear_axle(run, monkeypatch, tmp_path):
+    """A bicycle's state is of its centre of gravity."""
+    (attack,) = read_found([run])
+    bicycle = {"kind": "bicycle", "front_axle_m": 1.0, "rear_axle_m": 1.5}
+    section = read_section("vehicle", VehicleSection, bicycle, tmp_path)
+    scenario = attack.scenario.model_copy(update={"vehicle": section})
+    other = replace(attack, scenario=scenario)
+    monkeypatch.setattr(openscenario, "read_found", lambda runs: [other])
+    starts = []
+    for folder in (tmp_path / "bicycle", tmp_path / "before"):
+        path = openscenario.write_openscenario(run, folder)[0]
+        (place,) = ElementTree.parse(path).iterfind(
+            ".//Private[@entityRef='ego']//TeleportAction/Position/WorldPosition"
+        )
+        starts.append([float(place.get(key)) for key in "xyh"])
+        monkeypatch.undo()
+    (x, y, heading), (cx, cy, _) = starts
+    gap = 1.5 * np.array([np.cos(heading), np.sin(heading)])
+    np.testing.assert_allclose([x, y] + gap, [cx, cy])

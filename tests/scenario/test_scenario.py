@@ -14,7 +14,7 @@ from mi_nerfattack.io.resumable import differences
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.rollout.variation import SunRanges
-from mi_nerfattack.scenario.named_file import NamedFile, portable_text
+from mi_nerfattack.scenario.named_file import NamedFile, portable_text, section_content
 from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.scenario.world import initial_states
 from mi_nerfattack.scenes import resolve
@@ -259,6 +259,22 @@ def test_the_token_of_a_server_is_found_from_anywhere(load, tmp_path):
     scenario, text = load(HEAD.replace(POLICY, keys))
     again = replayed(scenario, text, tmp_path / "elsewhere")
     assert again.policy.token_file.name == str(tmp_path / "secret/token")
+
+
+def test_results_depend_on_a_servers_revision_and_not_on_patience(load, tmp_path):
+    def read(*keys):
+        url = 'url = "http://127.0.0.1:8000"'
+        return load(HEAD.replace(POLICY, "\n".join([url, *keys])))
+
+    first, _ = read()
+    patient, text = read("timeout_s = 60.0", "retries = 5")
+    assert dict(patient.leaves()) == dict(first.leaves())
+    assert section_content(patient.policy) == section_content(first.policy)
+    again = replayed(patient, text, tmp_path / "elsewhere")
+    assert (again.policy.timeout_s, again.policy.retries) == (60.0, 5)
+    newer, _ = read('revision = "epoch 40"')
+    assert dict(newer.leaves()) != dict(first.leaves())
+    assert section_content(newer.policy) != section_content(first.policy)
 
 
 def test_another_field_for_every_object_replays_anywhere(load, tmp_path):

@@ -98,6 +98,14 @@ def test_models_of_the_section():
     ) == models.KinematicBicycle(4.0, 1.0, 1.5, 20 * degree)
 
 
+def test_wheels_stand_where_the_models_point_says():
+    for kind in ("bicycle", "dynamic_single_track"):
+        car = vehicle(kind=kind, front_axle_m=1.0, rear_axle_m=1.5).car()
+        assert (car.wheelbase, car.reference) == (2.5, 1.5)
+    for kind in ("dubins", "ackermann", "kinematic_single_track"):
+        assert vehicle(kind=kind).car().reference == 0
+
+
 @pytest.mark.parametrize(
     ("name", "framework"),
     [("car.py:car", "drjit"), ("car.py:torch_car", "torch"), ("own_cars:car", "drjit")],

@@ -23,18 +23,20 @@ class Axles:
     Args:
         rear_m: x of the rear axle in the actor's frame, metres; mostly negative.
         wheelbase_m: from there to the front axle, metres.
+        reference_m: from the rear axle to the point that states refer to, metres.
     """
 
     rear_m: float
     wheelbase_m: float
+    reference_m: float = 0.0
 
     def body_to_world(self, actor_to_world: np.ndarray) -> np.ndarray:
-        """Move a pose (4, 4) from the actor's origin to the rear axle."""
-        return actor_to_world @ _shift(self.rear_m)
+        """Move a pose (4, 4) from the actor's origin to the reference point."""
+        return actor_to_world @ _shift(self.rear_m + self.reference_m)
 
     def actor_to_world(self, body_to_world: np.ndarray) -> np.ndarray:
-        """Move a pose (4, 4) from the rear axle to the actor's origin."""
-        return body_to_world @ _shift(-self.rear_m)
+        """Move a pose (4, 4) from the reference point to the actor's origin."""
+        return body_to_world @ _shift(-self.rear_m - self.reference_m)
 
 
 def read_axles(actor: Any, actor_to_world: np.ndarray) -> Axles:
@@ -71,7 +73,8 @@ class KinematicDriver:
     bridge it stays above what it crosses.
 
     Args:
-        vehicle: the model, whose state refers to the middle of the rear axle.
+        vehicle: the model.
+        reference_m: how far ahead of the rear axle the point of its state is, metres.
 
     Attributes:
         max_control: largest control that has an effect.
@@ -79,8 +82,8 @@ class KinematicDriver:
         more_controls: those after the first one.
     """
 
-    def __init__(self, vehicle: AbstractVehicle) -> None:
-        self.vehicle = vehicle
+    def __init__(self, vehicle: AbstractVehicle, reference_m: float = 0.0) -> None:
+        self.vehicle, self.reference_m = vehicle, reference_m
         self.max_control = vehicle.max_control
         self.control_unit = vehicle.control_unit
         self.more_controls = vehicle.more_controls

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -48,7 +49,7 @@ class CarlaEnvironment(AbstractEnvironment):
     Args:
         server: where it runs, its town and weather.
         camera: intrinsics: no distortion, square pixels, centred.
-        mount: the camera's pose, relative to the rear axle on the road.
+        mount: the camera's pose, relative to the point of the driver's state.
         driver: what moves the vehicle.
         period: seconds between two images, at most 0.16.
         vehicle: blueprint.
@@ -82,7 +83,7 @@ class CarlaEnvironment(AbstractEnvironment):
         self.max_control = driver.max_control
         self.control_unit = driver.control_unit
         self.more_controls = driver.more_controls
-        self._vehicle, self._axles = vehicle, axles
+        self._vehicle, self._axles = vehicle, axles and self._referred(axles)
         self._attributes = dict(attributes or {})
         self._mount = camera_to_body(mount)
         self._paster = Paster(camera, ())
@@ -131,7 +132,7 @@ class CarlaEnvironment(AbstractEnvironment):
 
     @property
     def state(self) -> np.ndarray:
-        """State (m,) of the model; x, y and heading of the rear axle come first."""
+        """State (m,) of the model; x, y and heading come first."""
         if self._cameras is None:
             raise InputError("environment 'carla': it has a state only after reset")
         return self.driver.vehicle.state
@@ -151,7 +152,7 @@ class CarlaEnvironment(AbstractEnvironment):
         self.session.close()
 
     def _spawn(self, start: np.ndarray) -> tuple[Axles, float]:
-        """Spawn the vehicle with its rear axle at a pose, standing.
+        """Spawn the vehicle with its reference point at a pose, standing.
 
         Returns:
             its axles, and the height of the road there: of the lane nearest to z = 0.
@@ -167,13 +168,16 @@ class CarlaEnvironment(AbstractEnvironment):
             return self._axles, height
         session.tick()
         measured = body_from_carla(read_pose(self._actor.get_transform()))
-        axles = read_axles(self._actor, measured)
+        axles = self._referred(read_axles(self._actor, measured))
         pose = axles.actor_to_world(planar_body(start))
         pose[2, 3] = height
         height = road_height(session, pose)
         pose[2, 3] = height + _DROP_M
         self._actor.set_transform(session.transform(body_to_carla(pose)))
         return axles, height
+
+    def _referred(self, axles: Axles) -> Axles:
+        return replace(axles, reference_m=self.driver.reference_m)
 
     def _observe(self, frame: int) -> CameraFrame:
         if self.session.world.get_snapshot().find(self._actor.id) is None:

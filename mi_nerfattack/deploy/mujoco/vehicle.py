@@ -101,10 +101,11 @@ class MujocoVehicle(AbstractVehicle):
     Where the car takes an acceleration, too, this changes the speed to hold, but never
     below 0; motor and brakes act on the rear wheels, whose grip limits both.
 
-    The state is (x, y, theta, speed, steering angle, heading rate) of the point on the
-    ground under the middle of the rear axle. x and y are in metres, and theta is in
-    radians and not wrapped. The speed is in metres per second along the car, the
-    steering angle in radians and the heading rate in radians per second.
+    The state is (x, y, theta, speed, steering angle, heading rate). x and y are of the
+    point on the ground that `car.reference` names, by default under the middle of the
+    rear axle. x and y are in metres, and theta is in radians and not wrapped. The speed
+    is that of the rear axle along the car, in metres per second. The steering angle is
+    in radians and the heading rate in radians per second.
 
     Args:
         car: dimensions.
@@ -164,11 +165,12 @@ class MujocoVehicle(AbstractVehicle):
         if not 0 <= speed < float("inf"):
             raise InputError(f"speed: {speed!r} m/s; a finite number of at least 0")
         x, y, theta = checked_pose(pose).tolist()
+        ahead = self.car.reference
         data = self._data
         mujoco.mj_resetData(self._model, data)
         data.qpos[:] = self._settled
         body = data.joint(mjcf_car.BODY)
-        body.qpos[:2] = x, y
+        body.qpos[:2] = x - ahead * math.cos(theta), y - ahead * math.sin(theta)
         body.qpos[3:] = math.cos(theta / 2), 0, 0, math.sin(theta / 2)
         body.qvel[:2] = speed * math.cos(theta), speed * math.sin(theta)
         for name in mjcf_car.WHEELS:
@@ -203,7 +205,7 @@ class MujocoVehicle(AbstractVehicle):
         body, rotation = data.joint(mjcf_car.BODY), self._rotation()
         return np.array(
             [
-                *body.qpos[:2],
+                *(body.qpos[:2] + self.car.reference * rotation[:2, 0]),
                 self._theta,
                 body.qvel[:3] @ rotation[:, 0],
                 data.joint(mjcf_car.COLUMN).qpos[0],
@@ -223,6 +225,7 @@ class MujocoVehicle(AbstractVehicle):
         matrix = np.eye(4)
         matrix[:3, :3] = self._rotation()
         matrix[:3, 3] = self._data.joint(mjcf_car.BODY).qpos[:3]
+        matrix[:3, 3] += self.car.reference * matrix[:3, 0]
         matrix[2, 3] -= self._settled[2]
         return matrix
 

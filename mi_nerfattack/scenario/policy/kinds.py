@@ -232,9 +232,11 @@ class HttpSection(AbstractPolicySection):
 
     kind: Literal["http"]
     url: str
-    timeout_s: Positive = 10.0  # of an answer
-    retries: Natural = 2
-    token_file: Annotated[File | None, Field(exclude=True)] = None  # no result's
+    revision: str | None = None  # of what answers: another one makes other results
+    #: Results do not depend on these.
+    timeout_s: Annotated[Positive, Field(exclude=True)] = 10.0  # of an answer
+    retries: Annotated[Natural, Field(exclude=True)] = 2
+    token_file: Annotated[File | None, Field(exclude=True)] = None
 
     def build(self, views: Views = NO_VIEWS) -> AbstractPolicy:
         """Make the client."""

@@ -35,8 +35,8 @@ STRAIGHT = Route("straight", 0, np.array([[2.0, 0.0], [90.0, 0.0]]), speed_ms=5.
 pytestmark = pytest.mark.usefixtures("variant")
 
 
-def kinematic() -> KinematicDriver:
-    return KinematicDriver(KinematicVehicle(Motion(Dubins()), PERIOD, 1.5))
+def kinematic(ahead: float = 0.0) -> KinematicDriver:
+    return KinematicDriver(KinematicVehicle(Motion(Dubins()), PERIOD, 1.5), ahead)
 
 
 def make(server: Server, driver=None, where=None, **options) -> CarlaEnvironment:
@@ -46,11 +46,12 @@ def make(server: Server, driver=None, where=None, **options) -> CarlaEnvironment
     )
 
 
+@pytest.mark.parametrize("ahead", [0.0, 1.2])
 @pytest.mark.parametrize("axles", [None, Axles(-1.0, 2.5)])
-def test_a_kinematic_drive_is_our_model_and_its_camera(axles):
+def test_a_kinematic_drive_is_our_model_and_its_camera(axles, ahead):
     """On a bridge, 8 m over a road that crosses it from x = 14 on."""
     server, twin = Server(), KinematicVehicle(Motion(Dubins()), PERIOD, 1.5)
-    environment = make(server, kinematic(), axles=axles)
+    environment = make(server, kinematic(ahead), axles=axles)
 
     def get_waypoint(location):
         above = math.hypot(location.y, location.z - 8)
@@ -62,9 +63,10 @@ def test_a_kinematic_drive_is_our_model_and_its_camera(axles):
     environment.session.town_map.get_waypoint = get_waypoint
     pose = np.array([0.0, 0.0, 0.01])
     frame = environment.reset(STRAIGHT, pose)
-    # the rear axle is on the pose, the origin ahead of it
+    # the reference point is on the pose, the rear axle and the origin from there
+    origin = -axles.rear_m if axles else 1.45
     actor = environment.session.world.get_snapshot().find(1).get_transform()
-    assert actor.location.x == pytest.approx(-axles.rear_m if axles else 1.45, abs=1e-3)
+    assert actor.location.x == pytest.approx(origin - ahead, abs=1e-3)
     twin.reset(pose, 5.0)
     for control in (0.0, 0.5, -1.0, 0.5, *[0.0] * 36):  # 20 m
         np.testing.assert_allclose(environment.state, twin.state, atol=1e-5)

@@ -75,6 +75,20 @@ def test_turn_radius_is_that_of_the_bicycle_model(car, steer, speed):
     assert states[-1, 5] == pytest.approx(rate, rel=0.02)  # and its sign
 
 
+def test_a_state_may_refer_to_a_point_ahead_of_the_rear_axle():
+    ahead, heading = 1.2, 0.7
+    twin = moving(CAR, pose=(1.0, 2.0, heading))
+    forward = ahead * np.array([math.cos(heading), math.sin(heading)])
+    pose = (*(np.array([1.0, 2.0]) + forward), heading)
+    vehicle = moving(replace(CAR, reference=ahead), pose=pose)
+    np.testing.assert_allclose(vehicle.state[:3], pose, atol=1e-12)
+    states, expected = turn(vehicle, 0.3, 20), turn(twin, 0.3, 20)
+    theta = expected[:, 2]
+    expected[:, :2] += ahead * np.stack([np.cos(theta), np.sin(theta)], axis=1)
+    np.testing.assert_allclose(states, expected, atol=1e-6)  # 3 mrad of pitch: 5 um
+    np.testing.assert_allclose(vehicle.body_to_world[:2, 3], states[-1, :2])
+
+
 def test_heading_rate_becomes_a_steering_angle():
     vehicle, small = MujocoVehicle(CAR), MujocoVehicle(SMALL_CAR)
     assert (vehicle.control_unit, small.control_unit) == ("rad/s", "rad")
