@@ -58,14 +58,20 @@ class Demo:
         )
 
     def _object_field(self, output: Path) -> Path | None:
-        """Return the field file of the object, fitting a mesh beside the run folder."""
+        """Return the field file of the object, fitting a mesh beside the run folder.
+
+        A demo that goes on takes the field that it began with.
+        """
+        from mi_nerfattack.io import files
+
         if self.object is None or self.object.suffix == ".safetensors":
             return self.object
         field = output.parent / f"{output.name}-object.safetensors"
-        AssetMesh(
-            source=self.object,
-            output=field,
-            height_m=self.height_m,
-            resolution=self.resolution,
-        ).run().show()
+        keys = {"height_m": self.height_m, "resolution": self.resolution}
+        source = {"mesh_sha256": files.sha256(self.object), **keys}
+        record = field.with_suffix(".json")
+        if field.exists() and record.exists() and files.read_json(record) == source:
+            return field
+        AssetMesh(source=self.object, output=field, **keys).run().show()
+        files.write_json(record, source)
         return field

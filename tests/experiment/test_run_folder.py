@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,10 @@ from support.faults.refusals import refused_at
 from support.worlds.attacks import contents, job, stop_at
 
 from mi_nerfattack import cli
+from mi_nerfattack.commands.asset import AssetMesh
+from mi_nerfattack.commands.demo import Demo
 from mi_nerfattack.commands.shared.progress import StageBars
+from mi_nerfattack.commands.shared.terminal import Result
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment import results
 from mi_nerfattack.experiment.claim import claimed
@@ -206,3 +210,27 @@ def test_seconds_are_those_since_the_command_began(folder, tmp_path, capsys):
     with StageBars(begun.started) as bars:
         bars.show("attack", 1, 1, "")
     assert int(capsys.readouterr().err.split()[0]) >= 1000
+
+
+def test_a_demo_that_goes_on_keeps_its_object(tmp_path, monkeypatch):
+    fits = []
+
+    def fit(asset):
+        fits.append((asset.height_m, asset.resolution))
+        asset.output.write_bytes(b"field")
+        return Result({}, lambda: None)
+
+    monkeypatch.setattr(AssetMesh, "run", fit)
+    mesh = tmp_path / "mesh.glb"
+    mesh.write_bytes(b"mesh")
+    demo = Demo(mesh, output=tmp_path / "run")
+    path = tmp_path / "run-object.safetensors"
+    for _ in range(2):
+        assert demo._object_field(demo.output) == path
+    assert fits == [(0.75, 64)]
+    mesh.write_bytes(b"other")
+    demo._object_field(demo.output)
+    replace(demo, height_m=1.5)._object_field(demo.output)
+    path.unlink()
+    replace(demo, height_m=1.5)._object_field(demo.output)
+    assert fits == [(0.75, 64)] * 2 + [(1.5, 64)] * 2
