@@ -8,6 +8,7 @@ from bench.accuracy import BenchAccuracy
 from bench.attack.bench import BenchAttack
 from bench.attack.scaling import BenchScaling
 from bench.capture import BenchGaps, BenchPoses
+from bench.certificates import BenchCertificates
 from bench.end_to_end import BenchEndToEnd
 from bench.fit.bench import BenchFit
 from bench.gpu import BenchFrames, BenchGpu
@@ -32,6 +33,7 @@ COMMANDS = {
     "vary": BenchVary,
     "roughness": BenchRoughness,
     "reach": BenchReach,
+    "certificates": BenchCertificates,
     "poses": BenchPoses,
     "gaps": BenchGaps,
     "frames": BenchFrames,

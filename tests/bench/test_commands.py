@@ -6,11 +6,12 @@ import itertools
 import json
 import math
 import sys
+from pathlib import Path
 from typing import get_type_hints
 
 import pytest
 
-from bench import end_to_end
+from bench import certificates, end_to_end
 from bench.__main__ import COMMANDS, main
 from bench.attack import bench as attack
 from bench.attack import scaling
@@ -174,3 +175,34 @@ class TestEndToEnd:
         monkeypatch.delenv("NERFATTACK_DATA", raising=False)
         assert main(["end_to_end", "-o", str(tmp_path)]) == cli.EXIT_INPUT
         assert "NERFATTACK_DATA is not set" in capsys.readouterr().err
+
+
+def test_certificates_are_made_once_and_counted(tmp_path, monkeypatch, capsys):
+    made = []
+
+    def certify(words):
+        made.append(words[2])
+        rows = [
+            {"time_s": 0.5, "is_true": None, "along_predicted": 0.0, "along_real": 0.0},
+            {
+                "time_s": 1.0,
+                "slope": 1.0 if words[2].endswith("one") else 3.0,
+                "cosine": 0.9,
+                "is_true": words[2].endswith("one"),
+                "along_predicted": 2.0,
+                "along_real": 1.0,
+            },
+        ]
+        folder = Path(words[4])
+        folder.mkdir(parents=True)
+        (folder / "certificate.json").write_text(json.dumps({"rows": rows}))
+
+    monkeypatch.setattr(certificates, "run_command", certify)
+    words = ["certificates", "runs/one", "runs/two", "-o", str(tmp_path)]
+    for _ in range(2):
+        assert main(words) == 0
+    assert made == ["runs/one", "runs/two"]
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == "| 1.0 s | 1 of 2 | 2.00 | 0.90 | 0.50 |"
+    assert "0.5 s" not in "".join(lines)  # nothing changes until then
+    assert (tmp_path / "certificates.csv").read_text().count("\n") == 5
