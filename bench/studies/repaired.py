@@ -77,12 +77,11 @@ def repaired(drives: pd.DataFrame) -> Finding:
             f"({_aim(NO_OBJECT, errors)}).",
         ),
         head=[
-            *("attacks", "environment", "number", "error before (m)", "after (m)"),
-            *("after, divided by before (geometric mean)", "95 % interval"),
-            *("drives out before", "drives out after"),
+            *("attacks", "environment", "error before (m)", "after (m)", "ratio"),
+            *("95 % interval", "drives out before", "after"),
         ],
         rows=[
-            [GROUPS[group], f"`{environment}`", *one.cells()]
+            [f"{GROUPS[group]} ({one.places})", f"`{environment}`", *one.cells()]
             for (group, environment), one in compared.items()
         ],
         draw=lambda figure: draw_ratios(
@@ -116,11 +115,11 @@ class _Compared:
     drives: int
 
     def cells(self) -> list[str]:
-        """Return a row of the table."""
+        """Return a row of the table, from the errors on."""
         means = [f"{mean:.3f}" for mean in self.means]
         out = [f"{count}/{self.drives}" for count in self.out]
         ratio = [f"{self.ratio:.2f}", ends_cell(self.ends, 2)]
-        return [str(self.places), *means, *ratio, *out]
+        return [*means, *ratio, *out]
 
 
 def _compare(drives: pd.DataFrame, group: str, environment: str) -> _Compared:

@@ -295,7 +295,7 @@ def test_a_policy_is_repaired_where_no_drive_leaves_the_lane():
     assert "has 0.25 times this error in the worse environment (reaches" in aims
     assert "it has 1.10 times this error (reaches" in aims
     assert answer.rows[5] == [
-        *("adaptive", "`mitsuba`", "5", "3.000", "2.250", "0.75", "0.75 to 0.75"),
+        *("adaptive (5)", "`mitsuba`", "3.000", "2.250", "0.75", "0.75 to 0.75"),
         *("5/5", "5/5"),
     ]
     some = retrained(departed=True).query("group != 'adaptive'")

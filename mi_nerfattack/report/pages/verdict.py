@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -149,71 +150,46 @@ def judge(
         subject: words for the kind of field.
         depth_m: median error of the depth near the camera, metres; NaN if unknown.
     """
-    criteria: list[Criterion] = []
-
-    def add(
-        figure: str, name: str, value: float, limit: float, at_least: bool, advice: str
-    ) -> None:
-        criteria.append(
-            Criterion(
-                figure,
-                name,
-                value,
-                limit=limit,
-                at_least=at_least,
-                advice=advice,
-                subject=subject,
-            )
-        )
-
-    psnr, worst = mean(scores, "psnr_db"), least(scores, "psnr_db")
-    add(
-        "views",
-        subject.views,
-        len(scores),
-        limit=MIN_VIEWS,
-        at_least=True,
-        advice=subject.few,
-    )
-    name = f"mean PSNR of {subject.views} (dB)"
-    add("psnr_db", name, psnr, limit=MIN_PSNR_DB, at_least=True, advice=subject.blurred)
-    name = f"least PSNR of {subject.views} (dB)"
-    add(
-        "psnr_min_db",
-        name,
-        worst,
-        limit=MIN_WORST_DB,
-        at_least=True,
-        advice=subject.worst,
-    )
-    name = f"share of rays with an opacity from {HAZY[0]:g} to {HAZY[1]:g}"
-    add(
-        "hazy",
-        name,
-        mean(scores, "hazy"),
-        limit=MAX_HAZY,
-        at_least=False,
-        advice=subject.fog,
-    )
+    above = partial(Criterion, at_least=True, subject=subject)
+    below = partial(Criterion, at_least=False, subject=subject)
+    mean_db, least_db = mean(scores, "psnr_db"), least(scores, "psnr_db")
+    name, least_name = (f"{x} PSNR of {subject.views} (dB)" for x in ("mean", "least"))
+    hazy_name = f"share of rays with an opacity from {HAZY[0]:g} to {HAZY[1]:g}"
+    hazy = mean(scores, "hazy")
+    criteria = [
+        above("views", subject.views, len(scores), limit=MIN_VIEWS, advice=subject.few),
+        above("psnr_db", name, mean_db, limit=MIN_PSNR_DB, advice=subject.blurred),
+        above(
+            "psnr_min_db",
+            least_name,
+            least_db,
+            limit=MIN_WORST_DB,
+            advice=subject.worst,
+        ),
+        below("hazy", hazy_name, hazy, limit=MAX_HAZY, advice=subject.fog),
+    ]
     if not np.isnan(holes := mean(scores, "holes")):
         name = f"share of known surfaces with an opacity below {SOLID:g}"
-        add("holes", name, holes, limit=MAX_HOLES, at_least=False, advice=subject.holes)
+        criteria.append(
+            below("holes", name, holes, limit=MAX_HOLES, advice=subject.holes)
+        )
     if not np.isnan(depth_m):
         name = "median error of the depth near the camera (m)"
-        add(
-            "depth_median_m",
-            name,
-            depth_m,
-            limit=MAX_DEPTH_M,
-            at_least=False,
-            advice=subject.depth,
+        criteria.append(
+            below(
+                "depth_median_m",
+                name,
+                depth_m,
+                limit=MAX_DEPTH_M,
+                advice=subject.depth,
+            )
         )
     if fitted_db is not None:
         pooled = pooled_db([score.psnr_db for score in scores])
         gap = 0.0 if pooled == fitted_db else fitted_db - pooled  # both may be infinite
         name = "PSNR of fitted rays less that of held-out ones (dB)"
-        add(
-            "gap_db", name, gap, limit=MAX_GAP_DB, at_least=False, advice=subject.learnt
+        criteria.append(
+            below("gap_db", name, gap, limit=MAX_GAP_DB, advice=subject.learnt)
         )
     return criteria
 
