@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from mi_nerfattack.experiment.retrain.compare import read_with_policy
@@ -12,7 +13,12 @@ from mi_nerfattack.experiment.sweep.sweep import Cells
 from mi_nerfattack.experiment.transfer.found import FoundAttack, read_found
 from mi_nerfattack.io import files, locks
 from mi_nerfattack.scenario.named_file import portable_text
-from mi_nerfattack.system.workers import AbstractWorkers, raise_failure, tally
+from mi_nerfattack.system.workers import (
+    AbstractWorkers,
+    Processes,
+    raise_failure,
+    tally,
+)
 
 
 def attack_anew(
@@ -42,6 +48,8 @@ def attack_anew(
     """
     cells = tuple(_cell(attack, policy) for attack in attacks)
     count = tally(progress, 0, len(cells))
+    if isinstance(workers, Processes):  # an attack leaves memory behind, as in a sweep
+        workers = replace(workers, pieces_each=1)
 
     def on_end(index: int, error: Exception | None) -> None:
         raise_failure(index, error)

@@ -19,7 +19,7 @@ from mi_nerfattack.capture.mesh.flat import FlatObject
 from mi_nerfattack.deploy.environment import drive
 from mi_nerfattack.deploy.sites import PlaceSite, Weather, expert_of
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.experiment.retrain import solvable
+from mi_nerfattack.experiment.retrain import anew, solvable
 from mi_nerfattack.experiment.retrain.among import (
     AmongFound,
     attacked_drives,
@@ -38,7 +38,7 @@ from mi_nerfattack.scenario.policy.kinds import PolicySection
 from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.scenario.section import read_section
 from mi_nerfattack.scenario.world import build_world, driven_route
-from mi_nerfattack.system.workers import InThisProcess
+from mi_nerfattack.system.workers import InThisProcess, Processes
 from mi_nerfattack.training.collect import collect
 from mi_nerfattack.training.sources import Scattered, Scenery
 from tests.experiment.conftest import CAMERA
@@ -255,3 +255,18 @@ def test_a_second_process_is_refused_before_it_attacks_anew(tmp_path):
     with locks.exclusive(tmp_path), pytest.raises(InputError, match="another process"):
         attack_anew([], "policy.file=absent", tmp_path, nothing)
     assert not list(tmp_path.iterdir())
+
+
+def test_each_attack_anew_has_a_process_of_its_own(tmp_path, monkeypatch):
+    crews = []
+
+    def note(crew, work, pieces, report, on_end):
+        crews.append((crew.count, crew.pieces_each, list(pieces)))
+
+    monkeypatch.setattr(Processes, "_do", note)
+    monkeypatch.setattr(anew, "_cell", lambda attack, policy: attack)
+    monkeypatch.setattr(anew, "folder_of", lambda folder, cell: folder / cell)
+    monkeypatch.setattr(anew, "read_found", lambda folders: folders)
+    attacks: Any = ["one", "two", "three"]
+    attack_anew(attacks, "policy.file=absent", tmp_path, Processes(2))
+    assert crews == [(2, 1, [0, 1, 2])]
