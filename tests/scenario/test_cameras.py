@@ -11,13 +11,16 @@ from support.worlds.attacks import write_scenario
 from mi_nerfattack import cli
 from mi_nerfattack.commands.shared.evaluate_options import PlaceOptions
 from mi_nerfattack.commands.shared.policy_file import PolicyFile, read_camera
+from mi_nerfattack.deploy.car import CAR
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.transfer.columns import make_columns
 from mi_nerfattack.io import files
 from mi_nerfattack.io.exr import read_layers
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
 from mi_nerfattack.render.camera.rig import Rig
+from mi_nerfattack.scenario.policy.kinds import PolicySection
 from mi_nerfattack.scenario.scenario import Scenario, load_scenario
+from mi_nerfattack.scenario.section import read_section
 from mi_nerfattack.scenario.world import build_world
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -176,3 +179,17 @@ def test_an_attack_on_a_policy_of_two_cameras(tmp_path):
         if label == "surrogate":  # the policy's derivative reaches both cameras
             cost = layers["cost.dR"]
             assert cost[:10, :24].any() and cost[:, 24:].any()
+
+
+def test_a_server_gets_all_cameras_side_by_side_and_numbers(tmp_path):
+    def section(*inputs):
+        keys = {"url": "http://127.0.0.1:8000", "inputs": list(inputs)}
+        return read_section("policy", PolicySection, keys, tmp_path)
+
+    both = section("speed", "front", "left")
+    both.check_driven(RIG.views, CAR)
+    assert both.build(RIG.views).sent == ("speed",)
+    assert section().build(RIG.views).sent == ()
+    assert section("image", "speed").build().sent == ("speed",)
+    with pytest.raises(InputError, match="side by side; name front, left"):
+        section("front", "speed").check_driven(RIG.views, CAR)

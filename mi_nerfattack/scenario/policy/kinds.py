@@ -17,6 +17,8 @@ from mi_nerfattack.policy.drjit_network import DrJitNetwork
 from mi_nerfattack.policy.exported import load_exported, load_torchscript
 from mi_nerfattack.policy.http.policy import HttpPolicy
 from mi_nerfattack.policy.inputs import (
+    IMAGE,
+    Inputs,
     IntegerGoal,
     NoGoal,
     OneHotGoal,
@@ -246,9 +248,21 @@ class HttpSection(AbstractPolicySection):
             retries=self.retries,
             preprocess=self.preprocess.build(),
             action=self.action(),
-            inputs=self.build_inputs(NO_VIEWS),  # the server gets the frame as it is
+            inputs=self.build_inputs(views),
             token="" if self.token_file is None else read_token(self.token_file.file),
         )
+
+    def build_inputs(self, views: Views) -> Inputs:
+        """Return what the server is given: the frame as it is, and numbers."""
+        inputs = super().build_inputs(views)
+        if {*inputs.images} < {*views}:
+            raise InputError(
+                "policy.inputs: a server gets the images of all cameras side by side; "
+                f"name {', '.join(views)}"
+            )
+        others = [name for name in self.inputs if name not in views]
+        names = (IMAGE, *others) if views and self.inputs else self.inputs
+        return Inputs(names, inputs.numbers)
 
 
 def _kind_of(keys: dict[str, Any]) -> str:
