@@ -192,4 +192,4 @@ def test_a_server_gets_all_cameras_side_by_side_and_numbers(tmp_path):
     assert section().build(RIG.views).sent == ()
     assert section("image", "speed").build().sent == ("speed",)
     with pytest.raises(InputError, match="side by side; name front, left"):
-        section("front", "speed").check_driven(RIG.views, CAR)
+        section("front", "speed").build(RIG.views)
