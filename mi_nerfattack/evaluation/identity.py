@@ -9,6 +9,7 @@ from typing import Any
 from mi_nerfattack.deploy.place import Conditions, Place
 from mi_nerfattack.deploy.sites import PlaceSite, Weather
 from mi_nerfattack.drives import spec
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import EvaluateSettings
 from mi_nerfattack.io.resumable import json_digest
 from mi_nerfattack.scenario.named_file import section_content
@@ -23,11 +24,22 @@ class EnvironmentUnder:
 
     Args:
         name: key of `deploy.registry.ENVIRONMENTS`.
-        conditions: of light and camera.
+        conditions: sky, exposure and samples; an evaluation has no others.
+
+    Raises:
+        InputError: the conditions have blur, noise or built-in objects.
     """
 
     name: str
     conditions: Conditions
+
+    def __post_init__(self) -> None:
+        conditions = self.conditions
+        if conditions.blur_px or conditions.noise_sd or conditions.built_in:
+            raise InputError(
+                f"environment {self.name!r}: an evaluation has no blur, noise or "
+                "built-in objects; drive past an attack with 'mi-nerfattack transfer'"
+            )
 
     @property
     def label(self) -> str:

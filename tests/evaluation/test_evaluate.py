@@ -32,6 +32,7 @@ from mi_nerfattack.evaluation.evaluate import (
     make_card,
     random_start,
 )
+from mi_nerfattack.evaluation.identity import EnvironmentUnder
 from mi_nerfattack.fields.io import load_grid
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.render.camera.intrinsics import from_fov
@@ -216,3 +217,10 @@ def test_the_room_has_starts_in_its_lane_and_objects_that_find_a_place():
         arguments = (route, RANDOM, run, [grid], around, few)
         driven = evaluate_run(environment, Counting(), *arguments)
         assert not driven.departed(limit).any()
+
+
+def test_conditions_that_no_identity_has_are_refused():
+    EnvironmentUnder("mitsuba", Conditions("evening", exposure_ev=1.0, spp=4))
+    for other in (Conditions(blur_px=1.0), Conditions(noise_sd=0.1)):
+        with pytest.raises(InputError, match="no blur, noise or built-in objects"):
+            EnvironmentUnder("mitsuba", other)
