@@ -90,7 +90,11 @@ def repaired(drives: pd.DataFrame) -> Finding:
         ),
         pandas="own = drives.query(\"case == 'attack'\")\n"
         'print(own.groupby(["group", "environment", "policy"]).departed.mean())',
-        threats=(_ADAPTIVE,) if ADAPTIVE in groups else (),
+        threats=(
+            (_ADAPTIVE, _uncertain(compared[ADAPTIVE, where], where))
+            if ADAPTIVE in groups
+            else ()
+        ),
     )
 
 
@@ -104,6 +108,7 @@ class _Compared:
         ratio: of both errors, geometric mean over the places.
         ends: of its interval.
         out: drives that leave the lane, before and after.
+        places_out: places with such drives, before and after.
         drives: of each policy.
     """
 
@@ -112,6 +117,7 @@ class _Compared:
     ratio: float
     ends: Interval
     out: tuple[int, int]
+    places_out: tuple[int, int]
     drives: int
 
     def cells(self) -> list[str]:
@@ -133,14 +139,29 @@ def _compare(drives: pd.DataFrame, group: str, environment: str) -> _Compared:
     errors: Any = own.pivot_table(ERROR, place, "policy", sort=False)
     logs = errors[AFTER].map(math.log) - errors[BEFORE].map(math.log)
     by_policy = own.groupby("policy")["departed"].agg(["sum", "size"])
+    by_place = own.groupby(["policy", *place])["departed"].any()
     return _Compared(
         places=len(errors),
         means=(errors[BEFORE].mean(), errors[AFTER].mean()),
         ratio=math.exp(logs.mean()),
         ends=geometric_interval(logs.to_numpy()),
         out=(int(by_policy["sum"][BEFORE]), int(by_policy["sum"][AFTER])),
+        places_out=(int(by_place[BEFORE].sum()), int(by_place[AFTER].sum())),
         drives=int(by_policy["size"][AFTER]),
     )
+
+
+def _uncertain(one: _Compared, where: str) -> str:
+    """Say how sure the comparison with adaptive attacks is, and where cars get out."""
+    counts = (
+        f"In `{where}`, drives leave the lane at {one.places_out[1]} of {one.places} "
+        f"places with the new attacks, and at {one.places_out[0]} with the old ones."
+    )
+    low, high = one.ends or (-math.inf, math.inf)
+    if not low < 1 < high:
+        return counts
+    words = "The interval of the ratio near adaptive attacks contains 1, so new attacks"
+    return f"{words} may be weaker or stronger than the old ones. {counts}"
 
 
 def _aimed(drives: pd.DataFrame) -> dict[str, float]:

@@ -298,6 +298,11 @@ def test_a_policy_is_repaired_where_no_drive_leaves_the_lane():
         *("adaptive (5)", "`mitsuba`", "3.000", "2.250", "0.75", "0.75 to 0.75"),
         *("5/5", "5/5"),
     ]
+    doubt = made("repaired", retrained(departed=True)).threats[1]
+    assert doubt == (
+        "In `mitsuba`, drives leave the lane at 5 of 5 places with the new attacks, "
+        "and at 5 with the old ones."
+    )
     some = retrained(departed=True).query("group != 'adaptive'")
     assert made("repaired", some).title.endswith("against old and held-out attacks")
     good = made("repaired", retrained(departed=False))
