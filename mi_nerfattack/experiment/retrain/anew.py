@@ -48,7 +48,7 @@ def attack_anew(
     """
     cells = tuple(_cell(attack, policy) for attack in attacks)
     count = tally(progress, 0, len(cells))
-    if isinstance(workers, Processes):  # an attack leaves memory behind, as in a sweep
+    if isinstance(workers, Processes):  # a process keeps the memory of its attack
         workers = replace(workers, pieces_each=1)
 
     def on_end(index: int, error: Exception | None) -> None:
