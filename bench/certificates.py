@@ -12,6 +12,7 @@ import tyro
 from bench.results import run_command
 from bench.tables import markdown
 from mi_nerfattack.commands.shared.terminal import Result
+from mi_nerfattack.drives.table import records
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.certify.robustness import DOCUMENT
 from mi_nerfattack.io import files
@@ -33,25 +34,28 @@ class BenchCertificates:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the certificates, and for the table, certificates.csv."""
     json: bool = False
-    """Print one line of JSON in place of the table."""
+    """Print one line of JSON instead of the table."""
 
     def run(self) -> Result:
         """Certify what has no certificate yet, and print the table."""
-        if not self.runs:
-            raise InputError("RUNS: none given; give folders of finished attacks")
-        parts: list[pd.DataFrame] = []
+        names = [folder.name for folder in self.runs]
+        if not names or len(set(names)) < len(names):
+            raise InputError(
+                f"RUNS: {names}; give folders of finished attacks, each name once"
+            )
+        tables: list[pd.DataFrame] = []
         for folder in self.runs:
             target = self.output / folder.name
             if not (target / DOCUMENT).exists():
                 run_command(["certify", "gradient", str(folder), "-o", str(target)])
             document = files.read_json(target / DOCUMENT)
-            part = pd.DataFrame(document["rows"]).reindex(columns=_COLUMNS)
-            part.insert(0, "attack", folder.name)
-            parts.append(part)
-            text = pd.concat(parts).to_csv(index=False, float_format="%.6g")
+            own = pd.DataFrame(document["rows"]).reindex(columns=_COLUMNS)
+            own.insert(0, "attack", folder.name)
+            tables.append(own)
+            text = pd.concat(tables).to_csv(index=False, float_format="%.6g")
             files.write_text(self.output / TABLE, text)
-        rows = pd.concat(parts, ignore_index=True)
-        document = {"rows": rows.to_dict("records")}
+        rows = pd.concat(tables, ignore_index=True)
+        document = {"rows": records(rows)}
         return Result(document, lambda: print(table(rows)))
 
 
@@ -62,10 +66,11 @@ def table(rows: pd.DataFrame) -> str:
     Horizons at which nothing changes, as where no object is in view, are left out.
     """
     lines = []
-    for time_s, part in rows[rows["is_true"].notna()].groupby("time_s"):
-        true = int(part["is_true"].astype(bool).sum())
-        along = part["along_real"] / part["along_predicted"]
-        medians = [part["slope"].median(), part["cosine"].median(), along.median()]
-        cells = [f"{time_s} s", f"{true} of {len(part)}"]
+    judged = rows[rows["is_true"].notna()]
+    for time_s, own in judged.groupby(judged["time_s"].round(6)):
+        true = int(own["is_true"].astype(bool).sum())
+        along = own["along_real"] / own["along_predicted"]
+        medians = [own["slope"].median(), own["cosine"].median(), along.median()]
+        cells = [f"{time_s} s", f"{true} of {len(own)}"]
         lines.append([*cells, *(f"{float(value):.2f}" for value in medians)])
     return markdown(["up to", "true", "slope", "cosine", "along"], lines)

@@ -44,7 +44,7 @@ COMMANDS = {
     "transfer": """transfer {work}/attack -o {work}/transfer --environments surrogate
         mitsuba --conditions day --cases no_object attack --workers 2""",
 }
-#: What the same commands were called in November 2026, and are called now.
+#: Words of commands now, and at commit f8ba392c.
 FORMER = {
     "capture scene ": "capture ",
     "capture photographs ": "capture ",
@@ -71,11 +71,11 @@ class BenchEndToEnd:
     other: Path | None = None
     """Checkout of another version."""
     former: bool = False
-    """The other checkout has the options of November 2026."""
+    """The other checkout has the options of commit f8ba392c."""
     repeats: int = 3
     """Turns of each command."""
     json: bool = False
-    """Print one line of JSON in place of the table."""
+    """Print one line of JSON instead of the table."""
 
     def run(self) -> Result:
         """Run what has no row yet, and print medians."""
@@ -100,14 +100,14 @@ class BenchEndToEnd:
                 if self.former and name == PEER:
                     for new, old in FORMER.items():
                         words = words.replace(new, old)
-                figures = _timed(checkouts[name], words, work=work, data=data)
+                figures = _timed(checkouts[name], words, work=work, data=Path(data))
                 labels = dict(zip(LABELS, (turn, command, name), strict=True))
                 rows = pd.concat([rows, pd.DataFrame([labels | figures])])
                 files.write_text(path, rows.to_csv(index=False, float_format="%.6g"))
         return Result({"rows": rows.to_dict("records")}, lambda: print(table(rows)))
 
 
-def _timed(checkout: Path, words: str, *, work: Path, data: str) -> dict[str, float]:
+def _timed(checkout: Path, words: str, *, work: Path, data: Path) -> dict[str, float]:
     """Run a command in a checkout.
 
     Returns:
@@ -119,7 +119,9 @@ def _timed(checkout: Path, words: str, *, work: Path, data: str) -> dict[str, fl
     for key, value in SHORT.items():
         text = re.sub(rf"^{key} = \d+", f"{key} = {value}", text, flags=re.MULTILINE)
     files.write_text(work / "short.toml", text)
-    line = shlex.split(words.format(scenes=scenes, work=work, data=data))
+    paths = {"scenes": scenes, "work": work, "data": data.resolve()}
+    quoted = {name: shlex.quote(str(path)) for name, path in paths.items()}
+    line = shlex.split(words.format(**quoted))
     for option in {"-o", "--data"} & {*line}:  # a command that was stopped starts again
         for path in work.glob(Path(line[line.index(option) + 1]).stem + "*"):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -151,9 +153,9 @@ def table(rows: pd.DataFrame) -> str:
     lines = []
     for command in COMMANDS:
         own, peer = medians[command, "this"], medians.get((command, PEER))
-        cells = [command, *map(number, own)]
+        others = ["–"] * 3
         if peer is not None:
-            cells += [*map(number, peer), f"{peer[0] / own[0]:.2f}"]
-        lines.append(cells)
+            others = [*map(number, peer), f"{peer[0] / own[0]:.2f}"]
+        lines.append([command, *map(number, own), *others])
     head = ["command", "s", "MB", "other, s", "other, MB", "other / this"]
-    return markdown(head[: len(lines[0])], lines)
+    return markdown(head, lines)

@@ -41,7 +41,11 @@ def draw_searches(figure: Figure, errors: pd.DataFrame) -> None:
     figure.legend(loc="outside upper center", ncols=6, frameon=False)
 
 
-def draw_ratios(figure: Figure, ratios: Mapping[str, tuple[float, Interval]]) -> None:
+def draw_ratios(
+    figure: Figure,
+    ratios: Mapping[str, tuple[float, Interval]],
+    label: str = "ratio of the mean errors, with its 95 % interval",
+) -> None:
     """Draw a ratio with its interval per row, logarithmic; the line is at 1."""
     axis = figure.subplots()
     for row, (ratio, ends) in enumerate(ratios.values()):
@@ -49,7 +53,7 @@ def draw_ratios(figure: Figure, ratios: Mapping[str, tuple[float, Interval]]) ->
         axis.plot([ratio], [row], "o", color=BLUE)
     axis.axvline(1, color=GREY, linestyle="--")
     _make_logarithmic(axis.xaxis)
-    axis.set_xlabel("ratio of the mean errors, with its 95 % interval")
+    axis.set_xlabel(label)
     _name_rows(figure, list(ratios))
 
 

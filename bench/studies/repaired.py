@@ -18,7 +18,7 @@ from bench.studies.content import (
     interval_words,
     with_labels,
 )
-from mi_nerfattack.evaluation.summary import Interval
+from mi_nerfattack.evaluation.summary import Interval, share_interval
 from mi_nerfattack.experiment.retrain.compare import (
     ADAPTIVE,
     AFTER,
@@ -41,6 +41,7 @@ _ADAPTIVE = (
     "and 'after' is the new policy near the new attacks. Both have equal places and "
     "budgets."
 )
+_LABEL = "geometric mean of the ratios by place, with its 95 % interval"
 
 
 def repaired(drives: pd.DataFrame) -> Finding:
@@ -57,7 +58,7 @@ def repaired(drives: pd.DataFrame) -> Finding:
     counts = {g: sum(compared[g, e].drives for e in worlds) for g in groups}
     listed = (f"{left[g]} of {counts[g]} ({name})" for g, name in groups.items())
     ratios = (
-        f"It is {one.ratio:.2f} near {name} attacks ({interval_words(one.ends, 2)})."
+        f"It is {one.ratio:.2f} for {name} attacks ({interval_words(one.ends, 2)})."
         for g, name in groups.items()
         for one in [compared[g, where]]
     )
@@ -65,16 +66,20 @@ def repaired(drives: pd.DataFrame) -> Finding:
     return Finding(
         title=_title({group: not count for group, count in left.items()}),
         sentences=(
-            "A group of attacks counts as repaired if no drive with one of them leaves "
-            f"the lane, in the surrogate and in `{where}`. With the new policy, these "
-            f"drives leave the lane: {', '.join(listed)}.",
-            f"The ratio is the error of the new policy in `{where}`, divided by the "
-            f"error of the old one (geometric mean). {' '.join(ratios)}",
-            "The two aims are multiples of the error that the old policy has without "
-            f"objects. Near old attacks, the new policy has {errors[ATTACK]:.2f} times "
-            f"this error in the worse environment ({_aim(ATTACK, errors)}). Without "
-            f"objects, it has {errors[NO_OBJECT]:.2f} times this error "
-            f"({_aim(NO_OBJECT, errors)}).",
+            "Old attacks were in the training, held-out attacks were not, and adaptive "
+            "attacks were made on the new policy. A group counts as repaired if no "
+            "drive with one of them leaves the lane, in the surrogate and in "
+            f"`{where}`. With the new policy, these drives leave the lane: "
+            f"{', '.join(listed)}.",
+            "At each place, we divide the error after the retraining by the error "
+            f"before. The geometric mean of these ratios in `{where}` differs from the "
+            f"quotient of the two means. {' '.join(ratios)}",
+            "Two aims were set before the first result: near old attacks, at most "
+            f"{AIMS[ATTACK]} times the error that the old policy has without objects, "
+            f"and without objects, at most {AIMS[NO_OBJECT]} times. The new policy has "
+            f"{errors[ATTACK]:.2f} ({_aim(ATTACK, errors)}) and "
+            f"{errors[NO_OBJECT]:.2f} times ({_aim(NO_OBJECT, errors)}), in the worse "
+            "environment.",
         ),
         head=[
             *("attacks", "environment", "error before (m)", "after (m)", "ratio"),
@@ -87,14 +92,14 @@ def repaired(drives: pd.DataFrame) -> Finding:
         draw=lambda figure: draw_ratios(
             figure,
             {f"{GROUPS[g]}, {e}": (x.ratio, x.ends) for (g, e), x in compared.items()},
+            _LABEL,
         ),
         pandas="own = drives.query(\"case == 'attack'\")\n"
         'print(own.groupby(["group", "environment", "policy"]).departed.mean())',
-        threats=(
-            (_ADAPTIVE, _uncertain(compared[ADAPTIVE, where], where))
-            if ADAPTIVE in groups
-            else ()
-        ),
+        threats=tuple(
+            _doubt(g, compared[g, where], where) for g in groups if g != ADAPTIVE
+        )
+        + ((_ADAPTIVE, _adaptive(drives, where)) if ADAPTIVE in groups else ()),
     )
 
 
@@ -151,17 +156,34 @@ def _compare(drives: pd.DataFrame, group: str, environment: str) -> _Compared:
     )
 
 
-def _uncertain(one: _Compared, where: str) -> str:
-    """Say how sure the comparison with adaptive attacks is, and where cars get out."""
-    counts = (
-        f"In `{where}`, drives leave the lane at {one.places_out[1]} of {one.places} "
-        f"places with the new attacks, and at {one.places_out[0]} with the old ones."
+def _doubt(group: str, one: _Compared, where: str) -> str:
+    """Say at how many places old and new policy leave the lane."""
+    before, after = one.places_out
+    ends = share_interval(after, one.places)
+    low, high = (100 * end for end in ends or (0.0, 1.0))
+    return (
+        f"In `{where}`, {GROUPS[group]} attacks make the old policy leave the lane at "
+        f"{before} of {one.places} places, so only there something could be repaired. "
+        f"The new policy leaves the lane at {after} places (share: 95 % interval "
+        f"{low:.0f} to {high:.0f} %)."
     )
-    low, high = one.ends or (-math.inf, math.inf)
-    if not low < 1 < high:
-        return counts
-    words = "The interval of the ratio near adaptive attacks contains 1, so new attacks"
-    return f"{words} may be weaker or stronger than the old ones. {counts}"
+
+
+def _adaptive(drives: pd.DataFrame, where: str) -> str:
+    """Say where new attacks are weaker than old ones, and where cars leave the lane."""
+    own = with_labels(drives[drives["case"] == ATTACK])
+    own = own[(own["group"] == ADAPTIVE) & (own["environment"] == where)]
+    errors: Any = own.pivot_table(ERROR, ["route", "seed"], "policy", sort=False)
+    weaker = int((errors[AFTER] < errors[BEFORE]).sum())
+    out: Any = own.pivot_table(
+        "departed", "route", "policy", aggfunc="sum", sort=False
+    ).astype(int)
+    routes = ", ".join(f"{x.Index} {x.before} and {x.after}" for x in out.itertuples())
+    return (
+        f"In `{where}`, the new attack is weaker than the old one at {weaker} of "
+        f"{len(errors)} places. Drives out by route, with old and new attacks: "
+        f"{routes}."
+    )
 
 
 def _aimed(drives: pd.DataFrame) -> dict[str, float]:
@@ -178,7 +200,7 @@ def _aimed(drives: pd.DataFrame) -> dict[str, float]:
 
 def _aim(case: str, errors: dict[str, float]) -> str:
     verb = "reaches" if errors[case] <= AIMS[case] else "misses"
-    return f"{verb} the aim of at most {AIMS[case]}"
+    return f"{verb} the aim"
 
 
 def _title(is_repaired: dict[str, bool]) -> str:

@@ -62,16 +62,25 @@ class Demo:
 
         A demo that goes on takes the field that it began with.
         """
+        from mi_nerfattack import variant
+        from mi_nerfattack.capture.object_views import Placement
         from mi_nerfattack.io import files
 
         if self.object is None or self.object.suffix == ".safetensors":
             return self.object
         field = output.parent / f"{output.name}-object.safetensors"
-        keys = {"height_m": self.height_m, "resolution": self.resolution}
-        source = {"mesh_sha256": files.sha256(self.object), **keys}
         record = field.with_suffix(".json")
-        if field.exists() and record.exists() and files.read_json(record) == source:
-            return field
-        AssetMesh(source=self.object, output=field, **keys).run().show()
-        files.write_json(record, source)
+        variant.ensure()
+        mesh = Placement(self.height_m).mesh(self.object)
+        source = {"mesh": mesh.digest, "resolution": self.resolution}
+        if field.exists() and record.exists():
+            if files.read_json(record) == {**source, "field": files.sha256(field)}:
+                return field
+        AssetMesh(
+            source=self.object,
+            output=field,
+            height_m=self.height_m,
+            resolution=self.resolution,
+        ).run().show()
+        files.write_json(record, {**source, "field": files.sha256(field)})
         return field

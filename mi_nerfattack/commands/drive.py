@@ -131,7 +131,11 @@ class DriveCommand:
         if rig is None:
             return config, Trained(policy)
         rig.require_one(f"{name}", "the car has one: take a policy of one")
-        return config, Trained(policy, rig.cameras[0], rig.mounts[0])
+        mount = rig.mounts[0]
+        if config.camera_file is None and file is not None and file.vehicle is not None:
+            ahead = file.vehicle.car().reference  # the mount is ahead of this point
+            mount = dataclasses.replace(mount, forward_m=mount.forward_m + ahead)
+        return config, Trained(policy, rig.cameras[0], mount)
 
 
 def _open_rig(

@@ -39,6 +39,7 @@ def kinematic_vehicle(place: Place) -> KinematicVehicle:
         car.max_control,
         control_unit=car.control_unit,
         more_controls=car.more_controls,
+        reference=car.reference,
     )
 
 
@@ -103,7 +104,7 @@ def _carla(place: Place, conditions: Conditions) -> AbstractEnvironment:
     _refuse_built_in("carla", conditions)
     _refuse_disturbed("carla", conditions)
     server = CarlaServer.parse(place.server, weather=_CARLA_WEATHER[conditions.sky])
-    driver = KinematicDriver(kinematic_vehicle(place), place.car.reference)
+    driver = KinematicDriver(kinematic_vehicle(place))
     exposure = {"exposure_compensation": str(conditions.exposure_ev)}
     return CarlaEnvironment(
         server,

@@ -32,11 +32,13 @@ class AbstractVehicle(ABC):
         max_control: largest control that has an effect; of several, the first one's.
         control_unit: "rad/s" of a heading rate, or "rad" of a steering angle.
         more_controls: those after the first one.
+        reference: how far ahead of the rear axle the point of the state is, metres.
     """
 
     max_control: float
     control_unit: str
     more_controls: tuple[Control, ...] = ()
+    reference: float = 0.0
 
     @property
     def control_names(self) -> tuple[str, ...]:
@@ -137,6 +139,7 @@ class KinematicVehicle(AbstractVehicle):
         max_control: where the model saturates the control.
         control_unit: "rad/s" (Dubins) or "rad" (models with a steering angle).
         more_controls: of the model, after the first one.
+        reference: how far ahead of the rear axle the model's point is, metres.
 
     Raises:
         InputError: the model takes another number of controls.
@@ -149,6 +152,7 @@ class KinematicVehicle(AbstractVehicle):
         max_control: float,
         control_unit: str = "rad/s",
         more_controls: tuple[Control, ...] = (),
+        reference: float = 0.0,
     ) -> None:
         if motion.dynamics.control_size != 1 + len(more_controls):
             names = ", ".join(motion.dynamics.control_names)
@@ -158,7 +162,7 @@ class KinematicVehicle(AbstractVehicle):
             )
         self.motion, self.more_controls = motion, more_controls
         self.period, self.max_control = period, max_control
-        self.control_unit = control_unit
+        self.control_unit, self.reference = control_unit, reference
         self._transitions: dict[float | None, Transition] = {}
         self._transition: Transition | None = None
         self._state: Any = None

@@ -38,7 +38,7 @@ class EnvironmentUnder:
         if conditions.blur_px or conditions.noise_sd or conditions.built_in:
             raise InputError(
                 f"environment {self.name!r}: an evaluation has no blur, noise or "
-                "built-in objects; drive past an attack with 'mi-nerfattack transfer'"
+                "built-in objects; give them to transfer, or to a scenario's deployment"
             )
 
     @property

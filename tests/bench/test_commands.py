@@ -201,6 +201,12 @@ def test_certificates_are_made_once_and_counted(tmp_path, monkeypatch, capsys):
     words = ["certificates", "runs/one", "runs/two", "-o", str(tmp_path)]
     for _ in range(2):
         assert main(words) == 0
+    capsys.readouterr()
+    assert main([*words, "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert rows[0]["slope"] is None and rows[1]["slope"] == 1.0
+    assert main([*words[:2], "other/one", *words[3:]]) == cli.EXIT_INPUT
+    assert main(words) == 0
     assert made == ["runs/one", "runs/two"]
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1] == "| 1.0 s | 1 of 2 | 2.00 | 0.90 | 0.50 |"

@@ -291,17 +291,18 @@ def test_a_policy_is_repaired_where_no_drive_leaves_the_lane():
     left = "0 of 10 (old), 0 of 10 (held-out), 10 of 10 (adaptive)."
     assert answer.sentences[0].endswith(left)
     _, errors, aims = answer.sentences
-    assert "It is 0.25 near old" in errors and "It is 0.75 near adaptive" in errors
-    assert "has 0.25 times this error in the worse environment (reaches" in aims
-    assert "it has 1.10 times this error (reaches" in aims
+    assert "It is 0.25 for old" in errors and "It is 0.75 for adaptive" in errors
+    assert "The new policy has 0.25 (reaches the aim) and 1.10 times" in aims
     assert answer.rows[5] == [
         *("adaptive (5)", "`mitsuba`", "3.000", "2.250", "0.75", "0.75 to 0.75"),
         *("5/5", "5/5"),
     ]
-    doubt = made("repaired", retrained(departed=True)).threats[1]
-    assert doubt == (
-        "In `mitsuba`, drives leave the lane at 5 of 5 places with the new attacks, "
-        "and at 5 with the old ones."
+    old, held_out, _, adaptive = answer.threats
+    assert "the old policy leave the lane at 5 of 5 places" in old
+    assert "new policy leaves the lane at 0 places (share: 95 %" in held_out
+    assert adaptive == (
+        "In `mitsuba`, the new attack is weaker than the old one at 5 of 5 places. "
+        "Drives out by route, with old and new attacks: left 5 and 5."
     )
     some = retrained(departed=True).query("group != 'adaptive'")
     assert made("repaired", some).title.endswith("against old and held-out attacks")

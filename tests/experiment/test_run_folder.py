@@ -221,16 +221,22 @@ def test_a_demo_that_goes_on_keeps_its_object(tmp_path, monkeypatch):
         return Result({}, lambda: None)
 
     monkeypatch.setattr(AssetMesh, "run", fit)
-    mesh = tmp_path / "mesh.glb"
-    mesh.write_bytes(b"mesh")
+    mesh = tmp_path / "mesh.obj"
+    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+    mesh.write_text(f"mtllib colours.mtl\nusemtl one\n{text}")
+    colours = tmp_path / "colours.mtl"
+    colours.write_text("newmtl one\nKd 1 0 0\n")
     demo = Demo(mesh, output=tmp_path / "run")
     path = tmp_path / "run-object.safetensors"
     for _ in range(2):
         assert demo._object_field(demo.output) == path
     assert fits == [(0.75, 64)]
-    mesh.write_bytes(b"other")
+    colours.write_text("newmtl one\nKd 0 1 0\n")  # another file of the mesh
     demo._object_field(demo.output)
+    path.write_bytes(b"of another fit")
+    demo._object_field(demo.output)
+    assert fits == [(0.75, 64)] * 3
     replace(demo, height_m=1.5)._object_field(demo.output)
     path.unlink()
     replace(demo, height_m=1.5)._object_field(demo.output)
-    assert fits == [(0.75, 64)] * 2 + [(1.5, 64)] * 2
+    assert fits == [(0.75, 64)] * 3 + [(1.5, 64)] * 2

@@ -14,6 +14,7 @@ from mi_nerfattack.backend.colour import linear_to_srgb_numpy, srgb_to_linear_nu
 from mi_nerfattack.capture.mesh.mitsuba_mesh import MeshArrays, make_mesh
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.extras import load_extra
+from mi_nerfattack.io.resumable import array_digest, json_digest
 
 #: A cube's faces as seen from outside: outward normal, right and up of the picture.
 #: Around -y, the front of a glTF model, they unfold into a cross.
@@ -101,6 +102,14 @@ class TexturedMesh:
         """Smallest and largest coordinates, (2, 3)."""
         used = np.concatenate([p.vertices[np.unique(p.faces)] for p in self.submeshes])
         return np.stack([used.min(0), used.max(0)])
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of everything but the name."""
+        values = [x for submesh in self.submeshes for x in vars(submesh).values()]
+        others = [None if isinstance(x, np.ndarray) else repr(x) for x in values]
+        arrays = array_digest(x for x in values if isinstance(x, np.ndarray))
+        return json_digest([arrays, others])
 
     @property
     def area(self) -> float:

@@ -23,20 +23,22 @@ class Axles:
     Args:
         rear_m: x of the rear axle in the actor's frame, metres; mostly negative.
         wheelbase_m: from there to the front axle, metres.
-        reference_m: from the rear axle to the point that states refer to, metres.
     """
 
     rear_m: float
     wheelbase_m: float
-    reference_m: float = 0.0
 
-    def body_to_world(self, actor_to_world: np.ndarray) -> np.ndarray:
-        """Move a pose (4, 4) from the actor's origin to the reference point."""
-        return actor_to_world @ _shift(self.rear_m + self.reference_m)
+    def body_to_world(
+        self, actor_to_world: np.ndarray, reference: float = 0.0
+    ) -> np.ndarray:
+        """Move a pose (4, 4) from the actor's origin to a vehicle's `reference`."""
+        return actor_to_world @ _shift(self.rear_m + reference)
 
-    def actor_to_world(self, body_to_world: np.ndarray) -> np.ndarray:
-        """Move a pose (4, 4) from the reference point to the actor's origin."""
-        return body_to_world @ _shift(-self.rear_m - self.reference_m)
+    def actor_to_world(
+        self, body_to_world: np.ndarray, reference: float = 0.0
+    ) -> np.ndarray:
+        """Move a pose (4, 4) from a vehicle's `reference` to the actor's origin."""
+        return body_to_world @ _shift(-self.rear_m - reference)
 
 
 def read_axles(actor: Any, actor_to_world: np.ndarray) -> Axles:
@@ -74,7 +76,6 @@ class KinematicDriver:
 
     Args:
         vehicle: the model.
-        reference_m: how far ahead of the rear axle the point of its state is, metres.
 
     Attributes:
         max_control: largest control that has an effect.
@@ -82,8 +83,8 @@ class KinematicDriver:
         more_controls: those after the first one.
     """
 
-    def __init__(self, vehicle: AbstractVehicle, reference_m: float = 0.0) -> None:
-        self.vehicle, self.reference_m = vehicle, reference_m
+    def __init__(self, vehicle: AbstractVehicle) -> None:
+        self.vehicle = vehicle
         self.max_control = vehicle.max_control
         self.control_unit = vehicle.control_unit
         self.more_controls = vehicle.more_controls
@@ -120,7 +121,7 @@ class KinematicDriver:
 
     def _place(self) -> None:
         body = self.vehicle.body_to_world
-        actor_to_world = self._axles.actor_to_world(body)
+        actor_to_world = self._axles.actor_to_world(body, self.vehicle.reference)
         actor_to_world[2, 3] = self._height
         self._height = road_height(self._session, actor_to_world)
         actor_to_world[2, 3] = self._height

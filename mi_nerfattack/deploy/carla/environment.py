@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -83,7 +82,7 @@ class CarlaEnvironment(AbstractEnvironment):
         self.max_control = driver.max_control
         self.control_unit = driver.control_unit
         self.more_controls = driver.more_controls
-        self._vehicle, self._axles = vehicle, axles and self._referred(axles)
+        self._vehicle, self._axles = vehicle, axles
         self._attributes = dict(attributes or {})
         self._mount = camera_to_body(mount)
         self._paster = Paster(camera, ())
@@ -103,7 +102,8 @@ class CarlaEnvironment(AbstractEnvironment):
             self._cameras = None
             self.session.clear()
             axles, height = self._spawn(start)
-            body_to_camera = axles.body_to_world(np.eye(4)) @ self._mount
+            reference = self.driver.vehicle.reference
+            body_to_camera = axles.body_to_world(np.eye(4), reference) @ self._mount
             self._cameras = CarlaCameras(
                 self.session,
                 self.camera,
@@ -157,27 +157,25 @@ class CarlaEnvironment(AbstractEnvironment):
         Returns:
             its axles, and the height of the road there: of the lane nearest to z = 0.
         """
-        session = self.session
+        session, reference = self.session, self.driver.vehicle.reference
         body = planar_body(start)
-        pose = body if self._axles is None else self._axles.actor_to_world(body)
+        known = self._axles
+        pose = body if known is None else known.actor_to_world(body, reference)
         height = road_height(session, pose)
         pose[2, 3] = height + _DROP_M
         role = {"role_name": "hero"}
         self._actor = session.spawn(self._vehicle, body_to_carla(pose), role)
-        if self._axles is not None:
-            return self._axles, height
+        if known is not None:
+            return known, height
         session.tick()
         measured = body_from_carla(read_pose(self._actor.get_transform()))
-        axles = self._referred(read_axles(self._actor, measured))
-        pose = axles.actor_to_world(planar_body(start))
+        axles = read_axles(self._actor, measured)
+        pose = axles.actor_to_world(body, reference)
         pose[2, 3] = height
         height = road_height(session, pose)
         pose[2, 3] = height + _DROP_M
         self._actor.set_transform(session.transform(body_to_carla(pose)))
         return axles, height
-
-    def _referred(self, axles: Axles) -> Axles:
-        return replace(axles, reference_m=self.driver.reference_m)
 
     def _observe(self, frame: int) -> CameraFrame:
         if self.session.world.get_snapshot().find(self._actor.id) is None:

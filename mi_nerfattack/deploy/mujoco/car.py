@@ -1,7 +1,7 @@
 """A car with four wheels as MJCF.
 
-The body's frame is that of the vehicle's state: its origin on the ground under the
-middle of the rear axle, x forward, y left, z up. Only the wheels and the floor of the
+The body's frame has its origin on the ground under the middle of the rear axle, x
+forward, y left, z up. Only the wheels and the floor of the
 body touch the ground, nothing of the car touches another part of it, so that the front
 wheels steer clear of the chassis.
 
@@ -120,10 +120,13 @@ def _set_options(spec: mujoco.MjSpec) -> None:
 
 
 def _add_chassis(body: Any, car: Car) -> None:
-    """Add the mass without the wheels, centred between the axles, and a shape."""
+    """Add the mass without the wheels, and a shape, which is centred.
+
+    The mass is at the centre of gravity of `car.reference`, or between the axles.
+    """
     height = 2 * _HEIGHT * car.wheelbase
     mass = car.mass * (1 - 4 * _WHEEL_MASS)
-    middle = [car.wheelbase / 2, 0, _HEIGHT * car.wheelbase]
+    middle = [car.reference or car.wheelbase / 2, 0, _HEIGHT * car.wheelbase]
     sides = np.array([car.length, car.width, height])
     body.mass, body.ipos = mass, middle
     body.inertia = mass / 12 * (sides @ sides - sides**2)

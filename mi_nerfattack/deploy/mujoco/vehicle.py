@@ -137,6 +137,7 @@ class MujocoVehicle(AbstractVehicle):
         self.steering = steering or _STEERING[car.control_unit](car.max_control)
         self.max_control = self.steering.max_control
         self.control_unit = self.steering.unit
+        self.reference = car.reference
         self.more_controls, force = (
             car.more_controls,
             acceleration_of(car.more_controls),
@@ -165,7 +166,7 @@ class MujocoVehicle(AbstractVehicle):
         if not 0 <= speed < float("inf"):
             raise InputError(f"speed: {speed!r} m/s; a finite number of at least 0")
         x, y, theta = checked_pose(pose).tolist()
-        ahead = self.car.reference
+        ahead = self.reference
         data = self._data
         mujoco.mj_resetData(self._model, data)
         data.qpos[:] = self._settled
@@ -205,7 +206,7 @@ class MujocoVehicle(AbstractVehicle):
         body, rotation = data.joint(mjcf_car.BODY), self._rotation()
         return np.array(
             [
-                *(body.qpos[:2] + self.car.reference * rotation[:2, 0]),
+                *(body.qpos[:2] + self.reference * rotation[:2, 0]),
                 self._theta,
                 body.qvel[:3] @ rotation[:, 0],
                 data.joint(mjcf_car.COLUMN).qpos[0],
@@ -225,7 +226,7 @@ class MujocoVehicle(AbstractVehicle):
         matrix = np.eye(4)
         matrix[:3, :3] = self._rotation()
         matrix[:3, 3] = self._data.joint(mjcf_car.BODY).qpos[:3]
-        matrix[:3, 3] += self.car.reference * matrix[:3, 0]
+        matrix[:3, 3] += self.reference * matrix[:3, 0]
         matrix[2, 3] -= self._settled[2]
         return matrix
 

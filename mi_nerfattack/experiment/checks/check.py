@@ -288,6 +288,7 @@ class Check:
             tops={n: _top(item) for n, item in zip(names, posed, strict=True)},
             starts=world.initial,
             car_width_m=scenario.vehicle.width_m,
+            car_reference_m=scenario.vehicle.car().reference,
             camera=world.surrogate.intrinsics,
             paths=paths,
         )

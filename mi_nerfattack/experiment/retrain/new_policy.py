@@ -59,9 +59,12 @@ class Successor:
 
     @property
     def content(self) -> dict[str, str]:
-        """Name and checksum of this file; the URL of a server."""
+        """Name and checksum of this file; URL and revision of a server."""
         if self._named is None:
-            return {"url": self.attacked.source}
+            revision = getattr(self.attacked, "revision", None)
+            return {"url": self.attacked.source} | (
+                {} if revision is None else {"revision": revision}
+            )
         return self._named[1].content()
 
     def check_suffix(self, output: Path) -> None:

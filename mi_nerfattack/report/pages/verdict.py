@@ -153,7 +153,8 @@ def judge(
     above = partial(Criterion, at_least=True, subject=subject)
     below = partial(Criterion, at_least=False, subject=subject)
     mean_db, least_db = mean(scores, "psnr_db"), least(scores, "psnr_db")
-    name, least_name = (f"{x} PSNR of {subject.views} (dB)" for x in ("mean", "least"))
+    name = f"mean PSNR of {subject.views} (dB)"
+    least_name = f"least PSNR of {subject.views} (dB)"
     hazy_name = f"share of rays with an opacity from {HAZY[0]:g} to {HAZY[1]:g}"
     hazy = mean(scores, "hazy")
     criteria = [

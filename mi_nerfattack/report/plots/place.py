@@ -53,6 +53,7 @@ class Overlay:
         tops: points (3,) above the objects by id.
         starts: states (n, 3) that drives start from; the first is the nominal one.
         car_width_m: of the car.
+        car_reference_m: of its states, ahead of its rear axle.
         camera: the car's; its frustum is drawn at the first start.
         paths: driven positions (n, 2) by title.
     """
@@ -63,6 +64,7 @@ class Overlay:
     tops: Mapping[str, np.ndarray] = field(default_factory=dict)
     starts: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     car_width_m: float = 1.8
+    car_reference_m: float = 0.0
     camera: Camera | None = None
     paths: Mapping[str, np.ndarray] = field(default_factory=dict)
 
@@ -210,7 +212,7 @@ def _draw_ground(
         style: dict[str, Any] = {"facecolor": CAMERA, "alpha": 0.22, "zorder": 4}
         axis.fill(*corners.T, label="what the camera sees", **style)
     for state in overlay.starts[::-1]:
-        corners = car_outline(state, overlay.car_width_m)
+        corners = car_outline(state, overlay.car_width_m, overlay.car_reference_m)
         style = {"fill": False, "edgecolor": START, "zorder": 6}
         axis.fill(*corners.T, label="cars at the starts", **style)
     draw_objects(axis, list(overlay.objects.values()), on_ground=True)
@@ -265,7 +267,10 @@ def _draw_look(axis: Axes, overlay: Overlay, name: str, look: Look) -> None:
             draw(centre, color=CENTRE, linewidth=1.2)
             for border in borders:
                 draw(border, color="white", linewidth=1.0, linestyle=(0, (4, 2)))
-        for ring in _car_box(overlay.starts[0], overlay.car_width_m):
+        corners = car_outline(
+            overlay.starts[0], overlay.car_width_m, overlay.car_reference_m
+        )
+        for ring in _car_box(corners, overlay.car_width_m):
             draw(ring, color=START, linewidth=1.5)
     for k, (label, top) in enumerate(overlay.tops.items()):
         at = seen_at(look.camera, look.camera_to_world, top[None])[0]
@@ -296,17 +301,19 @@ def _frustum(state: np.ndarray, camera: Camera, reach: float) -> np.ndarray:
     return np.concatenate([state[None, :2], arc])
 
 
-def car_outline(state: np.ndarray, width_m: float) -> np.ndarray:
-    """Return the corners (4, 2) of a car, whose state is that of its rear axle."""
+def car_outline(
+    state: np.ndarray, width_m: float, reference_m: float = 0.0
+) -> np.ndarray:
+    """Return the corners (4, 2) of a car; see `Overlay` for the last two arguments."""
     front, rear, y = _FRONT * width_m, -_REAR * width_m, width_m / 2
+    front, rear = front - reference_m, rear - reference_m
     corners = np.array([[front, y], [rear, y], [rear, -y], [front, -y]])
     c, s = np.cos(state[2]), np.sin(state[2])
     return corners @ np.array([[c, s], [-s, c]]) + state[:2]
 
 
-def _car_box(state: np.ndarray, width_m: float) -> list[np.ndarray]:
-    """Return the edges of a car's box as lines, (n, 3) each."""
-    corners = car_outline(state, width_m)
+def _car_box(corners: np.ndarray, width_m: float) -> list[np.ndarray]:
+    """Return the edges of a car's box as lines, (n, 3) each, from its outline."""
     ring = np.concatenate([corners, corners[:1]])
     low, high = _raised(ring, 0.1 * width_m), _raised(ring, 0.8 * width_m)
     posts = [np.stack([a, b]) for a, b in zip(low[:4], high[:4], strict=True)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, MutableMapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from pydantic import Field, model_validator
@@ -234,11 +234,12 @@ class HttpSection(AbstractPolicySection):
 
     kind: Literal["http"]
     url: str
-    revision: str | None = None  # of what answers: another one makes other results
+    revision: str | None = None  # names the server's weights; results depend on it
     #: Results do not depend on these.
     timeout_s: Annotated[Positive, Field(exclude=True)] = 10.0  # of an answer
     retries: Annotated[Natural, Field(exclude=True)] = 2
     token_file: Annotated[File | None, Field(exclude=True)] = None
+    later: ClassVar[tuple[str, ...]] = (*AbstractPolicySection.later, "revision")
 
     def build(self, views: Views = NO_VIEWS) -> AbstractPolicy:
         """Make the client."""
@@ -253,7 +254,7 @@ class HttpSection(AbstractPolicySection):
         )
 
     def build_inputs(self, views: Views) -> Inputs:
-        """Return what the server is given: the frame as it is, and numbers."""
+        """Return the inputs that the client sends: the whole frame, and numbers."""
         inputs = super().build_inputs(views)
         if {*inputs.images} < {*views}:
             raise InputError(

@@ -36,7 +36,8 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 def kinematic(ahead: float = 0.0) -> KinematicDriver:
-    return KinematicDriver(KinematicVehicle(Motion(Dubins()), PERIOD, 1.5), ahead)
+    motion = Motion(Dubins())
+    return KinematicDriver(KinematicVehicle(motion, PERIOD, 1.5, reference=ahead))
 
 
 def make(server: Server, driver=None, where=None, **options) -> CarlaEnvironment:
