@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 from support.pages.measured import page, results
 
+from bench import end_to_end
 from bench.attack.drive import SECONDS
 from bench.loop.bench import POLICIES, WAYS
 from bench.studies.findings import finding
@@ -305,6 +306,15 @@ def test_the_tables_of_fits_equal_their_rows():
         row = files.read_json(ROOT / f"bench/fits/{name}.report/metrics.json")
         (line,) = (x for x in text.splitlines() if x.startswith(f"| `{mesh}.glb`"))
         assert line.endswith(f"| {fit_psnr(name):.1f} dB | {row['wall_s']:.0f} s |")
+
+
+def test_the_table_of_whole_commands_equals_its_rows():
+    text = page("bench")
+    rows = pd.read_csv(ROOT / "bench/end_to_end/end_to_end.csv")
+    assert set(rows["command"]) == set(end_to_end.COMMANDS)
+    assert end_to_end.table(rows) in text
+    turns = {2: "two", 3: "three"}[rows["round"].nunique()]
+    assert f"medians of {turns} turns" in " ".join(text.split())
 
 
 def test_the_memory_of_six_objects_equals_its_row():
