@@ -32,6 +32,7 @@ from mi_nerfattack.policy.http.client import PolicyClient
 from mi_nerfattack.props import overlaid
 from mi_nerfattack.render.camera.intrinsics import CameraMount
 from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.scenes import bundled
 
 SIMULATED = ["car", "drive", "--policy", "expert", "--simulated", "--set", "spp=1"]
 
@@ -119,6 +120,21 @@ def test_a_policy_drives_the_car_that_it_was_trained_for():
     assert (config.control_unit, config.wheelbase_m) == ("rad", 0.325)
     with pytest.raises(InputError, match="wheelbase_m: 0.26, and .* says 0.325"):
         command._trained(read_config(None, room | {"wheelbase_m": 0.26}))
+
+
+def test_a_mount_counts_from_the_rear_axle(tmp_path):
+    """The state of a bicycle is that of its centre of gravity."""
+    keys = bundled("room.toml").read_text().partition("[policy]")[2]
+    path, mounts = tmp_path / "policy.toml", []
+    for vehicle in (
+        'kind = "ackermann"\nwheelbase_m = 0.325',
+        'kind = "bicycle"\nfront_axle_m = 0.125\nrear_axle_m = 0.2',
+    ):
+        sections = keys.partition("[vehicle]")[0]
+        path.write_text(f"[policy]{sections}[vehicle]\n{vehicle}\nwidth_m = 0.296\n")
+        _, trained = DriveCommand()._trained(read_config(None, {"policy": str(path)}))
+        mounts.append(trained.mount)
+    assert mounts[1].forward_m - mounts[0].forward_m == pytest.approx(0.2)
 
 
 class Pad(stand_ins.StandInEnable):

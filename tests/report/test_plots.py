@@ -115,6 +115,9 @@ def test_a_car_stands_about_its_rear_axle():
     corners = car_outline(np.array([2.0, 1.0, np.pi / 2]), 1.8)
     ends = [corners.min(0), corners.max(0)]
     np.testing.assert_allclose(ends, [[1.1, 0.1], [2.9, 4.42]])
+    # seen from a point 1.35 m ahead of the rear axle, the car is as far back
+    ahead = car_outline(np.array([2.0, 2.35, np.pi / 2]), 1.8, 1.35)
+    np.testing.assert_allclose(ahead, corners)
 
 
 def test_strip_doubles_frames_exactly(tmp_path, rng):
