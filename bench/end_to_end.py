@@ -9,6 +9,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -128,7 +129,7 @@ def _timed(checkout: Path, words: str, *, work: Path, data: Path) -> dict[str, f
     own = Path(__file__).resolve().parents[1] == checkout
     program = sys.executable if own else checkout / ".venv/bin/python"
     begin = time.monotonic()
-    with open(work / "log.txt", "ab") as log:
+    with tempfile.TemporaryFile() as log:
         child = subprocess.Popen(
             [program, "-m", "mi_nerfattack.cli", *line],
             cwd=checkout,
@@ -136,10 +137,12 @@ def _timed(checkout: Path, words: str, *, work: Path, data: Path) -> dict[str, f
             stderr=log,
         )
         _, status, usage = os.wait4(child.pid, 0)
-    seconds = time.monotonic() - begin
+        seconds = time.monotonic() - begin
+        log.seek(0)
+        files.write_bytes(work / "log.txt", log.read())  # of the last command
     child.returncode = os.waitstatus_to_exitcode(status)
     if child.returncode:
-        print(f"{checkout}: {shlex.join(line)}: see {log.name}", file=sys.stderr)
+        print(f"{checkout}: {shlex.join(line)}: see {work}/log.txt", file=sys.stderr)
         raise SystemExit(1)
     return {"seconds": seconds, "peak_mb": usage.ru_maxrss / 1e3}
 
