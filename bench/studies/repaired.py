@@ -144,7 +144,7 @@ def _compare(drives: pd.DataFrame, group: str, environment: str) -> _Compared:
     errors: Any = own.pivot_table(ERROR, place, "policy", sort=False)
     logs = errors[AFTER].map(math.log) - errors[BEFORE].map(math.log)
     by_policy = own.groupby("policy")["departed"].agg(["sum", "size"])
-    by_place = own.groupby(["policy", *place])["departed"].any()
+    by_place: Any = own.groupby(["policy", *place])["departed"].any()
     return _Compared(
         places=len(errors),
         means=(errors[BEFORE].mean(), errors[AFTER].mean()),
