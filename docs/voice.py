@@ -200,6 +200,8 @@ def _long_lines(markdown: str, tokens: Sequence[Token]) -> Iterator[Finding]:
         exempt = index in tables or _ONLY_A_LINK.match(line)
         if len(line) > MAX_CHARACTERS and not exempt:
             yield Finding(index + 1, "line", f"{len(line)} characters")
+        if line.lstrip().startswith("% "):
+            yield Finding(index + 1, "line", "begins with %: a comment of the site")
 
 
 def _machines(markdown: str) -> Iterator[Finding]:

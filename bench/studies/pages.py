@@ -127,11 +127,14 @@ def page_text(study: Study, made: Finding, one: State, picture: str) -> str:
 
 
 def _wrapped(text: str, indent: str = "") -> str:
-    """Break lines at 100 characters; links stay whole."""
+    """Break lines at 100 characters; links and percentages stay whole.
+
+    A line that begins with ``%`` is a comment in the site's Markdown.
+    """
     return textwrap.fill(
-        text,
+        text.replace(" %", "\0%"),
         100,
         subsequent_indent=indent,
         break_long_words=False,
         break_on_hyphens=False,
-    )
+    ).replace("\0%", " %")

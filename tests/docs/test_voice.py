@@ -162,6 +162,7 @@ def test_phrases_are_found(bad, good):
         ("It is `told`.\n\n```\ntold\n```\n\n| told |\n|---|", [(7, "phrase")]),
         ("x" * 100, []),
         ("x" * 101, [(1, "line")]),
+        ("a share of 5\n% is lost", [(2, "line")]),
         ("https://example.org/" + "x" * 100, []),
         ("see https://example.org/" + "x" * 100, [(1, "line")]),
         ("- [name](page.md#" + "x" * 100 + ").", []),
