@@ -1,9 +1,9 @@
 """A car with four wheels as MJCF.
 
 The body's frame has its origin on the ground under the middle of the rear axle, x
-forward, y left, z up. Only the wheels and the floor of the
-body touch the ground, nothing of the car touches another part of it, so that the front
-wheels steer clear of the chassis.
+forward, y left, z up. Only the wheels and the floor of the body touch the ground,
+nothing of the car touches another part of it, so that the front wheels steer clear of
+the chassis.
 
 - Tyres: one contact point each with Coulomb friction in an elliptic cone.
 - Steering: a column, whose angle is that of the bicycle model, turns the front wheels
