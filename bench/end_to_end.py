@@ -18,11 +18,11 @@ from typing import Annotated
 import pandas as pd
 import tyro
 
-from bench.results import progress
+from bench.results import data_folder, progress
+from bench.studies.plan import ROOT
 from bench.tables import markdown, number
 from mi_nerfattack.commands.shared.options import check_positive
 from mi_nerfattack.commands.shared.terminal import Result
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 
 #: Names of commands, and their words; later ones read what earlier ones wrote.
@@ -81,15 +81,12 @@ class BenchEndToEnd:
     def run(self) -> Result:
         """Run what has no row yet, and print medians."""
         check_positive(self, "repeats")
-        data = os.environ.get("NERFATTACK_DATA")
-        if data is None:
-            raise InputError("NERFATTACK_DATA is not set; it names a folder with fox")
-        checkouts = {"this": Path(__file__).resolve().parents[1]}
+        data, checkouts = data_folder().resolve(), {"this": ROOT}
         if self.other is not None:
             checkouts[PEER] = self.other.resolve()
         path = files.make_folder(self.output) / "end_to_end.csv"
-        rows = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=[*LABELS])
-        done = set(rows[[*LABELS]].itertuples(index=False, name=None))
+        rows = pd.read_csv(path).to_dict("records") if path.exists() else []
+        done = {tuple(row[label] for label in LABELS) for row in rows}
         turns = list(itertools.product(range(self.repeats), COMMANDS, checkouts))
         with progress() as show:
             for index, (turn, command, name) in enumerate(turns):
@@ -101,11 +98,12 @@ class BenchEndToEnd:
                 if self.former and name == PEER:
                     for new, old in FORMER.items():
                         words = words.replace(new, old)
-                figures = _timed(checkouts[name], words, work=work, data=Path(data))
                 labels = dict(zip(LABELS, (turn, command, name), strict=True))
-                rows = pd.concat([rows, pd.DataFrame([labels | figures])])
-                files.write_text(path, rows.to_csv(index=False, float_format="%.6g"))
-        return Result({"rows": rows.to_dict("records")}, lambda: print(table(rows)))
+                figures = _timed(checkouts[name], words, work=work, data=data)
+                rows.append({**labels, **figures})
+                text = pd.DataFrame(rows).to_csv(index=False, float_format="%.6g")
+                files.write_text(path, text)
+        return Result({"rows": rows}, lambda: print(table(pd.DataFrame(rows))))
 
 
 def _timed(checkout: Path, words: str, *, work: Path, data: Path) -> dict[str, float]:
@@ -120,14 +118,13 @@ def _timed(checkout: Path, words: str, *, work: Path, data: Path) -> dict[str, f
     for key, value in SHORT.items():
         text = re.sub(rf"^{key} = \d+", f"{key} = {value}", text, flags=re.MULTILINE)
     files.write_text(work / "short.toml", text)
-    paths = {"scenes": scenes, "work": work, "data": data.resolve()}
+    paths = {"scenes": scenes, "work": work, "data": data}
     quoted = {name: shlex.quote(str(path)) for name, path in paths.items()}
     line = shlex.split(words.format(**quoted))
     for option in {"-o", "--data"} & {*line}:  # a command that was stopped starts again
         for path in work.glob(Path(line[line.index(option) + 1]).stem + "*"):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
-    own = Path(__file__).resolve().parents[1] == checkout
-    program = sys.executable if own else checkout / ".venv/bin/python"
+    program = sys.executable if checkout == ROOT else checkout / ".venv/bin/python"
     begin = time.monotonic()
     with tempfile.TemporaryFile() as log:
         child = subprocess.Popen(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import importlib.metadata
+import os
 import platform
 import re
 import shlex
@@ -97,6 +98,20 @@ def compare(
     with progress() as show, tempfile.TemporaryDirectory() as folder:
         document = publish(name, options, measure(options, Path(folder), show))
     return Result(document, lambda: print(*lines(document), sep="\n"))
+
+
+def data_folder() -> Path:
+    """Return the folder of inputs that no checkout has.
+
+    Raises:
+        InputError: NERFATTACK_DATA is not set.
+    """
+    if not (data := os.environ.get("NERFATTACK_DATA")):
+        raise InputError(
+            "NERFATTACK_DATA: set it to the folder that has `fox` (NERFATTACK_DATA is "
+            "not set)"
+        )
+    return Path(data)
 
 
 def timed(

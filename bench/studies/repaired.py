@@ -99,7 +99,11 @@ def repaired(drives: pd.DataFrame) -> Finding:
         threats=tuple(
             _doubt(g, compared[g, where], where) for g in groups if g != ADAPTIVE
         )
-        + ((_ADAPTIVE, _adaptive(drives, where)) if ADAPTIVE in groups else ()),
+        + (
+            (_ADAPTIVE, _adaptive(compared[ADAPTIVE, where], where))
+            if ADAPTIVE in groups
+            else ()
+        ),
     )
 
 
@@ -113,7 +117,9 @@ class _Compared:
         ratio: of both errors, geometric mean over the places.
         ends: of its interval.
         out: drives that leave the lane, before and after.
+        routes_out: such drives by route, before and after.
         places_out: places with such drives, before and after.
+        weaker: places where the error is smaller after than before.
         drives: of each policy.
     """
 
@@ -122,7 +128,9 @@ class _Compared:
     ratio: float
     ends: Interval
     out: tuple[int, int]
+    routes_out: dict[str, tuple[int, int]]
     places_out: tuple[int, int]
+    weaker: int
     drives: int
 
     def cells(self) -> list[str]:
@@ -143,16 +151,20 @@ def _compare(drives: pd.DataFrame, group: str, environment: str) -> _Compared:
     place = ["route", "seed"] if group == ADAPTIVE else ["attack"]
     errors: Any = own.pivot_table(ERROR, place, "policy", sort=False)
     logs = errors[AFTER].map(math.log) - errors[BEFORE].map(math.log)
-    by_policy = own.groupby("policy")["departed"].agg(["sum", "size"])
+    routes: Any = own.pivot_table(
+        "departed", "route", "policy", aggfunc="sum", sort=False
+    ).astype(int)
     by_place: Any = own.groupby(["policy", *place])["departed"].any()
     return _Compared(
         places=len(errors),
         means=(errors[BEFORE].mean(), errors[AFTER].mean()),
         ratio=math.exp(logs.mean()),
         ends=geometric_interval(logs.to_numpy()),
-        out=(int(by_policy["sum"][BEFORE]), int(by_policy["sum"][AFTER])),
+        out=(int(routes[BEFORE].sum()), int(routes[AFTER].sum())),
+        routes_out={x.Index: (x.before, x.after) for x in routes.itertuples()},
         places_out=(int(by_place[BEFORE].sum()), int(by_place[AFTER].sum())),
-        drives=int(by_policy["size"][AFTER]),
+        weaker=int((errors[AFTER] < errors[BEFORE]).sum()),
+        drives=int((own["policy"] == AFTER).sum()),
     )
 
 
@@ -169,19 +181,12 @@ def _doubt(group: str, one: _Compared, where: str) -> str:
     )
 
 
-def _adaptive(drives: pd.DataFrame, where: str) -> str:
+def _adaptive(one: _Compared, where: str) -> str:
     """Say where new attacks are weaker than old ones, and where cars leave the lane."""
-    own = with_labels(drives[drives["case"] == ATTACK])
-    own = own[(own["group"] == ADAPTIVE) & (own["environment"] == where)]
-    errors: Any = own.pivot_table(ERROR, ["route", "seed"], "policy", sort=False)
-    weaker = int((errors[AFTER] < errors[BEFORE]).sum())
-    out: Any = own.pivot_table(
-        "departed", "route", "policy", aggfunc="sum", sort=False
-    ).astype(int)
-    routes = ", ".join(f"{x.Index} {x.before} and {x.after}" for x in out.itertuples())
+    routes = ", ".join(f"{name} {a} and {b}" for name, (a, b) in one.routes_out.items())
     return (
-        f"In `{where}`, the new attack is weaker than the old one at {weaker} of "
-        f"{len(errors)} places. Drives out by route, with old and new attacks: "
+        f"In `{where}`, the new attack is weaker than the old one at {one.weaker} of "
+        f"{one.places} places. Drives out by route, with old and new attacks: "
         f"{routes}."
     )
 

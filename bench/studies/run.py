@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -13,7 +12,13 @@ from typing import Any, ClassVar
 import numpy as np
 import pandas as pd
 
-from bench.results import command_of, run_command, run_for_output, stamp
+from bench.results import (
+    command_of,
+    data_folder,
+    run_command,
+    run_for_output,
+    stamp,
+)
 from bench.studies.pages import write_pages
 from bench.studies.plan import (
     ROOT,
@@ -344,9 +349,7 @@ def _split(line: str, study: Study) -> list[str]:
         InputError: it reads the folder of NERFATTACK_DATA, which is not set.
     """
     if "{data}" in line:
-        if not (data := os.environ.get("NERFATTACK_DATA")):
-            raise InputError("NERFATTACK_DATA: set it to the folder that has `fox`")
-        line = line.replace("{data}", shlex.quote(data))
+        line = line.replace("{data}", shlex.quote(str(data_folder())))
     words = shlex.split(line.replace("{work}", shlex.quote(str(study.work))))
     return [name for word in words for name in _expanded(word)]
 

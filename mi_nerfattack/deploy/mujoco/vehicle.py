@@ -206,7 +206,7 @@ class MujocoVehicle(AbstractVehicle):
         body, rotation = data.joint(mjcf_car.BODY), self._rotation()
         return np.array(
             [
-                *(body.qpos[:2] + self.reference * rotation[:2, 0]),
+                *self.body_to_world[:2, 3],
                 self._theta,
                 body.qvel[:3] @ rotation[:, 0],
                 data.joint(mjcf_car.COLUMN).qpos[0],

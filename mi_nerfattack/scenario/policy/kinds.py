@@ -17,7 +17,6 @@ from mi_nerfattack.policy.drjit_network import DrJitNetwork
 from mi_nerfattack.policy.exported import load_exported, load_torchscript
 from mi_nerfattack.policy.http.policy import HttpPolicy
 from mi_nerfattack.policy.inputs import (
-    IMAGE,
     Inputs,
     IntegerGoal,
     NoGoal,
@@ -254,16 +253,14 @@ class HttpSection(AbstractPolicySection):
         )
 
     def build_inputs(self, views: Views) -> Inputs:
-        """Return the inputs that the client sends: the whole frame, and numbers."""
+        """Return the inputs; the client sends the frame of all cameras as it is."""
         inputs = super().build_inputs(views)
         if {*inputs.images} < {*views}:
             raise InputError(
                 "policy.inputs: a server gets the images of all cameras side by side; "
                 f"name {', '.join(views)}"
             )
-        others = [name for name in self.inputs if name not in views]
-        names = (IMAGE, *others) if views and self.inputs else self.inputs
-        return Inputs(names, inputs.numbers)
+        return inputs
 
 
 def _kind_of(keys: dict[str, Any]) -> str:
