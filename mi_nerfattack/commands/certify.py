@@ -67,11 +67,10 @@ class CertifyRobustness:
             RobustnessSettings,
             certify_robustness,
         )
+        from mi_nerfattack.experiment.servers import scenario_workers
         from mi_nerfattack.io import files
         from mi_nerfattack.report.certificate import robustness_table
-        from mi_nerfattack.scenario.policy.kinds import HttpSection
         from mi_nerfattack.scenario.scenario import load_scenario
-        from mi_nerfattack.system.workers import chosen_workers
 
         files.check_folder(self.output)
         settings = RobustnessSettings(
@@ -87,8 +86,7 @@ class CertifyRobustness:
         )
         scenario, _ = load_scenario(self.scenario, settings=self.settings)
         variant.ensure()
-        alone = isinstance(scenario.policy, HttpSection)
-        workers = chosen_workers(self.workers, alone)
+        workers = scenario_workers([scenario], self.workers, self.environment)
         with StageBars() as bars:
             document = certify_robustness(
                 scenario,
@@ -124,7 +122,7 @@ class CertifyGradient:
     """Standard deviation of the random changes of raw colours, before the sigmoid; of
     poses, as a share of their learning rate."""
     workers: int | None = None
-    """Processes that drive; by default one per core, 1 for a policy behind a URL."""
+    """Processes that drive; by default one per core."""
     json: bool = False
     """End with one line of JSON, the content of certificate.json."""
 

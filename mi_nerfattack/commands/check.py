@@ -96,7 +96,7 @@ class Check:
         forecast = Forecast(cells, self.output and self.output.resolve(), show)
         forecast.run(not self.no_drives)
         document = forecast.document()
-        lines = sentences(document, cells_at_a_time(self.workers, cores=1))
+        lines = sentences(document, cells_at_a_time(cells, self.workers))
         code = int(any(document["refused"].values()))
         return Result(document, lambda: print(*lines, sep="\n"), code)
 

@@ -253,11 +253,9 @@ class Evaluate:
         return parse_conditions(self.environments, self.conditions, self.spp)
 
     def _workers(self, policy: AbstractPolicySection) -> AbstractWorkers:
-        from mi_nerfattack.scenario.policy.kinds import HttpSection
         from mi_nerfattack.system.workers import chosen_workers
 
-        # a server that keeps a state would mix the drives of several processes
-        alone = "carla" in self.environments or isinstance(policy, HttpSection)
+        alone = "carla" in self.environments or policy.is_remote
         return chosen_workers(self.workers, alone)
 
 

@@ -55,10 +55,7 @@ class Reproduce:
     def run(self) -> Result:
         """Read, repeat, compare and tell."""
         from mi_nerfattack import variant
-        from mi_nerfattack.commands.shared.cells import (
-            cells_at_a_time,
-            do_cells,
-        )
+        from mi_nerfattack.commands.shared.cells import cell_workers, do_cells
         from mi_nerfattack.commands.shared.options import check_positive
         from mi_nerfattack.errors import InputError
         from mi_nerfattack.experiment.sweep.reproduce import (
@@ -69,16 +66,15 @@ class Reproduce:
         )
         from mi_nerfattack.experiment.sweep.table import read_made, read_table
         from mi_nerfattack.io import files
-        from mi_nerfattack.system.workers import Processes
 
         if self.rows < 0 or not (self.row or self.rows):
             raise InputError("reproduce: no row; give ROW, or --rows 1 or more")
         check_positive(self, "cores")
         if self.output is not None:
             files.check_folder(self.output)
-        workers = Processes(cells_at_a_time(self.workers, self.cores), pieces_each=1)
         variant.ensure()
         replay = read_replay(self.folder, self.row, self.rows, seed=self.seed)
+        workers = cell_workers(replay.cells, self.workers, self.cores)
         with self._place({cell.id for cell in replay.cells}) as place:
             output = Path(place)
             if self.drives_only:

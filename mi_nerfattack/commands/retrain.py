@@ -300,11 +300,9 @@ class Retrain:
 
     def _workers(self, policy: AbstractPolicySection) -> AbstractWorkers:
         """Return who drives a policy."""
-        from mi_nerfattack.scenario.policy.kinds import HttpSection
         from mi_nerfattack.system.workers import chosen_workers
 
-        # A server that keeps a state would mix the drives of several processes
-        return chosen_workers(self.workers, isinstance(policy, HttpSection))
+        return chosen_workers(self.workers, policy.is_remote)
 
     def _place(self, attacks: Sequence[FoundAttack]) -> Place:
         from mi_nerfattack.experiment.retrain.among import found_place

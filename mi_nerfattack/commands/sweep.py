@@ -54,44 +54,44 @@ class Sweep:
         """Do the cells of the grid."""
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.options import check_positive
+        from mi_nerfattack.errors import InputError
         from mi_nerfattack.experiment.sweep.grid import load_cells
         from mi_nerfattack.experiment.sweep.summary import read_taken
         from mi_nerfattack.io import files
 
         check_positive(self, "cores", "memory_gb", "minutes")
-        workers = self._workers()
+        if self.ray is not None and self.submitit is not None:
+            raise InputError("--ray: stands beside --submitit; give one of them")
         files.check_folder(self.output)
         variant.ensure()
-        return self._run(load_cells(self.grid), workers, read_taken(self.take))
+        cells = load_cells(self.grid)
+        return self._run(cells, self._workers(cells), read_taken(self.take))
 
-    def _count(self) -> int:
-        from mi_nerfattack.commands.shared.cells import cells_at_a_time
-        from mi_nerfattack.system.workers import MOST
-
-        if self.workers is None and self.submitit is not None:
-            return MOST
-        return cells_at_a_time(self.workers, self.cores)
-
-    def _workers(self) -> AbstractWorkers:
+    def _workers(self, cells: list[Cell]) -> AbstractWorkers:
+        from mi_nerfattack.commands.shared.cells import cell_workers, chosen_count
         from mi_nerfattack.errors import InputError
         from mi_nerfattack.system.ray_tasks import RayTasks
         from mi_nerfattack.system.slurm import SlurmJobs
-        from mi_nerfattack.system.workers import Processes
+        from mi_nerfattack.system.workers import MOST, InThisProcess
 
-        if self.ray is not None and self.submitit is not None:
-            raise InputError("--ray: stands beside --submitit; give one of them")
-        alone = Processes(self._count(), pieces_each=1)  # checks the number, too
+        local = cell_workers(cells, self.workers, self.cores)  # checks the number, too
+        if self.ray is None and self.submitit is None:
+            return local
+        if isinstance(local, InThisProcess):
+            raise InputError(
+                f"{self.grid}: a deployment in CARLA, whose server one process steps; "
+                "leave out --ray and --submitit"
+            )
+        count = chosen_count(cells, self.workers)
         if self.ray is not None:
-            return RayTasks(self.ray, self.cores, self.memory_gb, count=self.workers)
-        if self.submitit is None:
-            return alone
+            return RayTasks(self.ray, self.cores, self.memory_gb, count=count)
         return SlurmJobs(
             self.output.resolve() / "slurm",
             self.submitit,
             self.cores,
             memory_gb=self.memory_gb,
             minutes=self.minutes,
-            count=self._count(),
+            count=MOST if count is None else count,
         )
 
     def _run(self, cells: list[Cell], workers: AbstractWorkers, taken: Taken) -> Result:

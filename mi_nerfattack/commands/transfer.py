@@ -90,14 +90,12 @@ class Transfer:
         from mi_nerfattack.io import files
         from mi_nerfattack.report.plots.transfer import quality_condition
         from mi_nerfattack.report.table import quality_table, transfer_table
-        from mi_nerfattack.scenario.policy.kinds import HttpSection
         from mi_nerfattack.system.workers import chosen_workers
 
         files.check_folder(self.output)
         variant.ensure()
         work = self._work()
-        policies = [attack.scenario.policy for attack in work.attacks]
-        alone = any(isinstance(policy, HttpSection) for policy in policies)
+        alone = any(attack.scenario.policy.is_remote for attack in work.attacks)
         workers = chosen_workers(self.workers, alone)
         check_output(self.output)
         with StageBars() as bars:

@@ -24,6 +24,7 @@ from mi_nerfattack.experiment.checks import before_attack
 from mi_nerfattack.experiment.claim import LOOKS, claimed
 from mi_nerfattack.experiment.finished import Finished, Frames, Run
 from mi_nerfattack.experiment.run_folder import Account, Effort, RunFolder
+from mi_nerfattack.experiment.servers import scenario_workers
 from mi_nerfattack.extras import require
 from mi_nerfattack.rollout.drive import (
     ATTACK,
@@ -33,13 +34,12 @@ from mi_nerfattack.rollout.drive import (
     RANDOM,
     departure_limit,
 )
-from mi_nerfattack.scenario.deployment import SURROGATE, CarlaDeployment, labelled
+from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.named_file import portable_text
-from mi_nerfattack.scenario.policy.kinds import HttpSection
 from mi_nerfattack.scenario.scenario import Scenario, is_within, load_scenario
 from mi_nerfattack.scenario.world import World, build_attack, build_world
 from mi_nerfattack.scenes import resolve
-from mi_nerfattack.system.workers import AbstractWorkers, InThisProcess, chosen_workers
+from mi_nerfattack.system.workers import AbstractWorkers, InThisProcess
 
 #: Called with a sentence.
 OnNotice = Callable[[str], None]
@@ -376,14 +376,6 @@ def attack_claimed(
         require("videos of all cases", "av")
     variant.ensure()
     policy = described.build_policy()
-    sections = [section for _, section in labelled(described.deployment)]
-    alone = isinstance(described.policy, HttpSection)
-    has_server = any(isinstance(section, CarlaDeployment) for section in sections)
-    if has_server and workers is not None and workers != 1:
-        raise InputError(
-            f"workers: {workers} for a deployment in CARLA, whose server one process "
-            "steps; give 1"
-        )
     with one_thread():
         job = Job(
             described,
@@ -394,6 +386,6 @@ def attack_claimed(
             on_notice=on_notice,
             started=started,
             frames=frames,
-            workers=chosen_workers(workers, alone or has_server),
+            workers=scenario_workers([described], workers),
         )
         return job.run_claimed(force, anyway)

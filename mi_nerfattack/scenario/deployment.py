@@ -42,6 +42,8 @@ class AbstractDeploymentSection(Section):
 
     name: Label | None = None
     group: ClassVar[str] = "mi_nerfattack.environments"
+    #: Whether it is a server that one process steps.
+    has_one_client: ClassVar[bool] = False
 
     def place(self, place: Place) -> Place:
         """Add what this environment needs of a place."""
@@ -106,6 +108,7 @@ class CarlaDeployment(AbstractDeploymentSection):
     sky: Sky = "day"
     exposure_ev: Finite = 0.0
     server: str = "127.0.0.1:2000"  # HOST:PORT or HOST:PORT/TOWN
+    has_one_client: ClassVar[bool] = True
 
     def place(self, place: Place) -> Place:
         """Name the server."""

@@ -9,7 +9,7 @@ import importlib
 import importlib.util
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from importlib.machinery import PathFinder, SourceFileLoader
 from pathlib import Path
 from types import ModuleType
@@ -97,23 +97,35 @@ def helper_files(path: str | Path) -> dict[str, Path]:
     Returns:
         files by dotted name; empty where the file itself cannot be parsed.
     """
-    folder, helpers, queue = Path(path).parent, dict[str, Path](), [("", Path(path))]
+    return _modules(Path(path).parent, _imported("", Path(path)))
+
+
+def module_files(name: str) -> dict[str, Path]:
+    """Find the modules in the current folder that ``python -m name`` runs.
+
+    Returns:
+        files by dotted name, as of `helper_files`.
+    """
+    return _modules(Path(), [name, f"{name}.__main__"])
+
+
+def _modules(folder: Path, names: Iterable[str]) -> dict[str, Path]:
+    """Return the files of modules of a folder, and of what these import from it."""
+    modules, queue = dict[str, Path](), list(names)
     while queue:
-        package, source = queue.pop()
-        for name in _imported(package, source):
-            segments = name.split(".")
-            for count in range(1, len(segments) + 1):
-                dotted = ".".join(segments[:count])
-                place = folder.joinpath(*segments[:count])
-                candidates = place / "__init__.py", place.with_suffix(".py")
-                file = next(filter(os.path.isfile, candidates), None)
-                if file is None or segments[0] in _NO_HELPERS:
-                    break
-                if dotted not in helpers:
-                    helpers[dotted] = file
-                    is_package = file.name == "__init__.py"
-                    queue.append((dotted if is_package else _parent(dotted), file))
-    return helpers
+        segments = queue.pop().split(".")
+        for count in range(1, len(segments) + 1):
+            dotted = ".".join(segments[:count])
+            place = folder.joinpath(*segments[:count])
+            candidates = place / "__init__.py", place.with_suffix(".py")
+            file = next(filter(os.path.isfile, candidates), None)
+            if file is None or segments[0] in _NO_HELPERS:
+                break
+            if dotted not in modules:
+                modules[dotted] = file
+                is_package = file.name == "__init__.py"
+                queue += _imported(dotted if is_package else _parent(dotted), file)
+    return modules
 
 
 def _imported(package: str, path: Path) -> Iterator[str]:

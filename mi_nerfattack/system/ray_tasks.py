@@ -34,8 +34,7 @@ class RayTasks(AbstractWorkers):
             this machine is part of; `LOCAL`.
         cores: cores of each task.
         memory_gb: memory of each task, GB.
-        count: number of tasks at a time, for which a cluster of this machine is made;
-            None: as many as the machine has cores for.
+        count: most tasks at a time; None: as many as the cluster has room for.
     """
 
     address: str
@@ -62,8 +61,12 @@ class RayTasks(AbstractWorkers):
                 max_calls=1,  # another process for each
             )
             task = remote(do_alone)
-            running = {task.remote(work, piece): piece for piece in pieces}
-            while running:
+            left, running = list(reversed(pieces)), {}
+            most = len(pieces) if self.count is None else self.count
+            while left or running:
+                while left and len(running) < most:
+                    piece = left.pop()
+                    running[task.remote(work, piece)] = piece
                 (ended,), _ = ray.wait(list(running), num_returns=1)
                 piece = running.pop(ended)
                 on_end(piece, _error(ray, piece, ended))

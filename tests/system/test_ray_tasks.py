@@ -6,10 +6,11 @@ import json
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
-pytest.importorskip("ray", reason="needs the extra 'ray', which runs tasks")
+from mi_nerfattack.system.ray_tasks import RayTasks
 
 SCRIPT = """
 import json
@@ -33,9 +34,37 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.parametrize(("count", "most"), [(2, 2), (None, 5)])
+def test_no_more_tasks_than_chosen_are_submitted(monkeypatch, count, most):
+    """Against a double of Ray that keeps tasks until it is asked for one."""
+    waiting, lengths, ended = [], [], []
+
+    def wait(tasks, num_returns):
+        lengths.append(len(tasks))
+        return [waiting.pop(0)], []
+
+    def submit(work, piece):
+        waiting.append(piece)
+        return piece
+
+    double = SimpleNamespace(
+        nodes=lambda: [{"Alive": True, "Resources": {"CPU": 9, "memory": 1e12}}],
+        remote=lambda **options: lambda function: SimpleNamespace(remote=submit),
+        wait=wait,
+        get=lambda task: ("done", ""),
+        shutdown=lambda: None,
+        exceptions=SimpleNamespace(RayError=KeyError),
+    )
+    monkeypatch.setattr(RayTasks, "_connect", lambda self: double)
+    RayTasks("a:1", count=count).run(None, range(5), print, lambda *e: ended.append(e))
+    assert max(lengths) == most and len(lengths) == 5
+    assert ended == [(piece, None) for piece in range(5)]
+
+
 @pytest.mark.slow
 def test_tasks_tell_what_became_of_them(tmp_path):
     """In a process of its own: Ray leaves threads and files behind."""
+    pytest.importorskip("ray", reason="needs the extra 'ray', which runs tasks")
     (tmp_path / "run.py").write_text(SCRIPT)
     folder = os.path.dirname(__file__)
     paths = os.pathsep.join([folder, *sys.path])

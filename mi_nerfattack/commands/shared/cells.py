@@ -10,14 +10,57 @@ if TYPE_CHECKING:
     from mi_nerfattack.experiment.sweep.cell import Cell
     from mi_nerfattack.experiment.sweep.summary import Taken
     from mi_nerfattack.experiment.sweep.sweep import Sweep
+    from mi_nerfattack.scenario.scenario import Scenario
     from mi_nerfattack.system.workers import AbstractWorkers
 
 
-def cells_at_a_time(workers: int | None, cores: int) -> int:
-    """Return `workers`, by default how many of so many cores have room here."""
+def chosen_count(cells: Sequence[Cell], workers: int | None) -> int | None:
+    """Return how many cells are done at a time; None: as many as there is room for.
+
+    Args:
+        cells: of the sweep.
+        workers: as the user chose it.
+
+    Raises:
+        InputError: several in CARLA.
+    """
+    from mi_nerfattack.experiment.servers import need_one_process
+
+    return 1 if need_one_process(_scenarios(cells), workers) else workers
+
+
+def cells_at_a_time(cells: Sequence[Cell], workers: int | None, cores: int = 1) -> int:
+    """Return how many cells, of so many cores each, this machine does at a time.
+
+    Raises:
+        InputError: see `chosen_count`.
+    """
     from mi_nerfattack.system.workers import available_cores
 
-    return max(1, available_cores() // cores) if workers is None else workers
+    count = chosen_count(cells, workers)
+    return max(1, available_cores() // cores) if count is None else count
+
+
+def cell_workers(
+    cells: Sequence[Cell], workers: int | None, cores: int
+) -> AbstractWorkers:
+    """Return who does cells on this machine: this process, where they are in CARLA.
+
+    Raises:
+        InputError: see `chosen_count`, or the number is out of range.
+    """
+    from mi_nerfattack.experiment.servers import drives_in_carla
+    from mi_nerfattack.system.workers import InThisProcess, Processes
+
+    count = cells_at_a_time(cells, workers, cores)
+    if drives_in_carla(_scenarios(cells)):
+        return InThisProcess()  # it gives the server back, however the work ends
+    return Processes(count, pieces_each=1)
+
+
+def _scenarios(cells: Sequence[Cell]) -> list[Scenario]:
+    """Return a scenario of each kind of cell; seeds decide nothing here."""
+    return [cell.scenario for cell in {cell.kind: cell for cell in cells}.values()]
 
 
 def do_cells(

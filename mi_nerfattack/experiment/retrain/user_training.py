@@ -9,6 +9,7 @@ import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -18,7 +19,11 @@ from mi_nerfattack.experiment.retrain.shown_process import ending, run_shown
 from mi_nerfattack.io import files
 from mi_nerfattack.io.locks import exclusive
 from mi_nerfattack.io.resumable import json_digest
-from mi_nerfattack.scenario.user_code import helper_files, load_function
+from mi_nerfattack.scenario.user_code import (
+    helper_files,
+    load_function,
+    module_files,
+)
 from mi_nerfattack.training.dataset import SHARDS
 
 #: What may stand between braces in a command, and what it becomes.
@@ -144,10 +149,13 @@ class CommandTraining(AbstractUserTraining):
     def code(self) -> dict[str, str]:
         """Return checksums of files among its words, and of what Python imports."""
         words = self._words
+        modules = [name for option, name in pairwise(words) if option == "-m"]
         words += [value for word in words if (value := word.partition("=")[2])]
         named = {word: Path(word) for word in words if os.path.isfile(word)}
         for path in [path for path in named.values() if path.suffix == ".py"]:
             named |= helper_files(path)
+        for name in modules:
+            named |= module_files(name)
         return _checksums(named)
 
     def run(self, order: TrainingOrder, lock: int | None) -> None:

@@ -14,6 +14,7 @@ import pandas as pd
 from mi_nerfattack import variant
 from mi_nerfattack.errors import InputError, RefusedError
 from mi_nerfattack.experiment.job import quiet
+from mi_nerfattack.experiment.servers import need_one_process
 from mi_nerfattack.experiment.sweep.cell import (
     CELLS,
     PROVENANCE,
@@ -233,7 +234,8 @@ def sweep(
             `mi_nerfattack.progress()`.
 
     Raises:
-        InputError: the grid or a file is wrong, or another process works in the folder.
+        InputError: the grid or a file is wrong, several workers are given for CARLA,
+            or another process works in the folder.
     """
     variant.ensure()
     cells = tuple(load_cells(Path(grid)))
@@ -243,6 +245,7 @@ def sweep(
         progress("cells", len(state.complete), len(cells), remark)
 
     work = Cells(cells, files.make_folder(Path(folder)).resolve())
+    need_one_process([cell.scenario for cell in cells], workers)  # refuses others
     crew = Processes(workers, pieces_each=1) if workers > 1 else InThisProcess()
     Sweep(work, show).run(crew)
     write_summary(work.folder)

@@ -50,6 +50,9 @@ class AbstractPolicySection(Section):
 
     later: ClassVar[tuple[str, ...]] = ("inputs", "route_m", "trajectory")
     group: ClassVar[str] = "mi_nerfattack.policies"
+    #: Whether a server has the policy; it may keep a state, which several processes
+    #: would mix.
+    is_remote: ClassVar[bool] = False
     #: Times of the positions that the kind itself gives, seconds; () where none.
     own_times_s: ClassVar[tuple[float, ...]] = ()
     #: Control period that the kind was trained with, seconds; None where any will do.

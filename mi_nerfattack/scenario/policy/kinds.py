@@ -239,6 +239,7 @@ class HttpSection(AbstractPolicySection):
     retries: Annotated[Natural, Field(exclude=True)] = 2
     token_file: Annotated[File | None, Field(exclude=True)] = None
     later: ClassVar[tuple[str, ...]] = (*AbstractPolicySection.later, "revision")
+    is_remote: ClassVar[bool] = True
 
     def build(self, views: Views = NO_VIEWS) -> AbstractPolicy:
         """Make the client."""

@@ -182,6 +182,24 @@ def test_files_of_one_name_both_count(tmp_path):
     assert len(before) == 4  # Python, the script, and both
 
 
+def test_modules_of_the_current_folder_count(tmp_path, monkeypatch):
+    """``python -m mine.train`` runs a module, its packages, and what they import."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine").mkdir()
+    for name, text in (
+        *(("__init__", ""), ("train", "from mine import loss\nfrom . import data")),
+        *(("loss", "import json"), ("data", ""), ("unused", ""), ("__main__", "")),
+    ):
+        (tmp_path / "mine" / f"{name}.py").write_text(text)
+    names = ["mine", "mine.data", "mine.loss", "mine.train"]
+    code = CommandTraining("python -m mine.train {data} {out}").code()
+    assert sorted(code) == names
+    assert sorted(CommandTraining("python -m mine").code()) == ["mine", "mine.__main__"]
+    assert CommandTraining("python -m json.tool -m").code() == {}
+    (tmp_path / "mine" / "data.py").write_text("A = 1")
+    assert CommandTraining("python -m mine.train {data} {out}").code() != code
+
+
 FAILS = "import sys\nfor k in range(40): print('line', k)\nsys.exit(7)"
 
 

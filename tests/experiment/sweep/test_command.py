@@ -7,12 +7,14 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from support.worlds import attacks as attack_jobs
 
 from mi_nerfattack import cli
 from mi_nerfattack.commands.sweep import Sweep
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.sweep import sweep as module
 from mi_nerfattack.experiment.sweep.forecast import sentences
+from mi_nerfattack.experiment.sweep.grid import load_cells
 from mi_nerfattack.system import workers
 from mi_nerfattack.system.ray_tasks import RayTasks
 from mi_nerfattack.system.slurm import SlurmJobs
@@ -46,13 +48,23 @@ position_m = [7.0, 4.2, 4.6]
 
 
 @pytest.fixture
-def command(scenario_folder, tmp_path, capsys):
+def grid_file(scenario_folder):
+    """Return what writes a grid next to the scenario, and returns its file."""
+
+    def write(text):
+        path = scenario_folder / "grid.toml"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+@pytest.fixture
+def command(grid_file, tmp_path, capsys):
     """Return what runs the command on a grid: exit code, output, errors."""
 
     def run(text, *options, verb="sweep"):
-        path = scenario_folder / "grid.toml"
-        path.write_text(text)
-        words = [verb, str(path), "-o", str(tmp_path / "out"), *options]
+        words = [verb, str(grid_file(text)), "-o", str(tmp_path / "out"), *options]
         code = cli.main(words)
         out, err = capsys.readouterr()
         return code, out, err
@@ -99,7 +111,7 @@ def test_cells_are_done_and_failures_told(command, tmp_path, monkeypatch):
         finish(cell, folder)
 
     monkeypatch.setattr(module, "Cells", partial(module.Cells, task=task))
-    monkeypatch.setattr(Sweep, "_workers", lambda self: InThisProcess())
+    monkeypatch.setattr(Sweep, "_workers", lambda self, cells: InThisProcess())
     code, out, _ = command(GRID)
     assert code == 1
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
@@ -116,18 +128,49 @@ def test_cells_are_done_and_failures_told(command, tmp_path, monkeypatch):
     assert not document["failed"]
 
 
-def test_who_does_the_cells(monkeypatch):
+def test_who_does_the_cells(grid_file, monkeypatch):
     monkeypatch.setattr(workers, "cores", lambda: 8)
     grid = Path("grid.toml")
-    counts = [Sweep(grid, grid, cores=cores)._count() for cores in (1, 3, 9)]
+    cells = load_cells(grid_file(GRID))
+
+    def crew(cells=cells, **options):
+        return Sweep(grid, grid, **options)._workers(cells)
+
+    counts = [crew(cores=cores).count for cores in (1, 3, 9)]
     assert counts == [8, 2, 1]  # as many as cores allow
-    assert Sweep(grid, grid, workers=5, cores=3)._count() == 5
+    assert crew(workers=5, cores=3) == Processes(5, pieces_each=1)
     there = {"cores": 2, "memory_gb": 3.0}
-    assert Sweep(grid, grid, workers=3)._workers() == Processes(3, pieces_each=1)
     jobs = SlurmJobs(grid.resolve() / "slurm", "gpu", 2, 3.0, 240, 256)
-    assert Sweep(grid, grid, submitit="gpu", **there)._workers() == jobs
-    assert Sweep(grid, grid, ray="a:1", **there)._workers() == RayTasks("a:1", 2, 3.0)
+    assert crew(submitit="gpu", **there) == jobs
+    assert crew(ray="a:1", **there) == RayTasks("a:1", 2, 3.0)
+    assert crew(ray="a:1", workers=4, **there) == RayTasks("a:1", 2, 3.0, count=4)
     with pytest.raises(InputError, match="--ray: .*--submitit"):
-        Sweep(grid, grid, ray="a:1", submitit="gpu")._workers()
+        Sweep(grid, grid, ray="a:1", submitit="gpu").run()
     with pytest.raises(InputError, match="--memory-gb: 0; "):
         Sweep(grid, grid, memory_gb=0).run()
+
+
+def test_a_server_has_one_process(grid_file, tmp_path, monkeypatch):
+    """CARLA's has one client; a policy's may keep a state, unless the user knows."""
+    monkeypatch.setattr(workers, "cores", lambda: 8)
+    served = GRID + '[[methods]]\nname = "random"\nset.attack.method.kind = "random"\n'
+    carla = served + 'set.deployment = [{ kind = "carla" }]\n'
+    own = '[policy]\nkind = "http"\nurl = "http://127.0.0.1:1"\n'
+    changes = {'[policy]\nfile = "policy.safetensors"\n': own}
+    scenario = attack_jobs.write_scenario(tmp_path, changes) / "scenario.toml"
+    url = served.partition("[[methods]]")[0] + served[len(GRID) :]
+    url = url.replace("scenario.toml", str(scenario))
+    grid = Path("grid.toml")
+
+    def crew(text, **options):
+        return Sweep(grid, grid, **options)._workers(load_cells(grid_file(text)))
+
+    assert crew(carla) == crew(carla, workers=1) == InThisProcess()
+    assert crew(url) == Processes(1, pieces_each=1)
+    assert crew(url, ray="a:1") == RayTasks("a:1", count=1)
+    assert crew(url, workers=3) == Processes(3, pieces_each=1)
+    for options in ({"workers": 2}, {"ray": "a:1"}, {"submitit": "gpu"}):
+        with pytest.raises(InputError, match="CARLA, whose server one process steps"):
+            crew(carla, **options)
+    with pytest.raises(InputError, match="workers: 2 for a deployment in CARLA"):
+        module.sweep(grid_file(carla), grid, workers=2)
