@@ -347,14 +347,10 @@ class Retrain:
     ) -> ImitationSettings:
         from dataclasses import replace
 
-        from mi_nerfattack.evaluation.evaluate import EvaluateSettings
         from mi_nerfattack.experiment.retrain.among import attacked_drives
         from mi_nerfattack.experiment.transfer.columns import PASTED
-        from mi_nerfattack.training.settings import (
-            CLONING,
-            CollectSettings,
-            ImitationSettings,
-        )
+        from mi_nerfattack.training.presets import collecting_for, evaluation_for
+        from mi_nerfattack.training.settings import CLONING, ImitationSettings
         from mi_nerfattack.training.sources import Mixture
         from mi_nerfattack.training.train import TrainSettings
 
@@ -365,13 +361,14 @@ class Retrain:
         # where the attacked policy goes, the expert shows it the way back
         cloning = Mixture((CLONING, attacked_drives(policy, place.rig)), (0.6, 0.4))
         width = place.car.width
-        drives = EvaluateSettings(runs=1, objects=(), car_width_m=width)
+        drives = evaluation_for(width)
+        drives = replace(drives, runs=1, objects=(), car_width_m=width)
         return ImitationSettings(
             frames=frames,
             seed=self.seed,
             validate_every=self.epochs,
             cloning=cloning,
-            collecting=CollectSettings(shard=32),
+            collecting=replace(collecting_for(width), shard=32),
             training=TrainSettings(
                 self.epochs, self.batch, learning_rate=self.learning_rate
             ),

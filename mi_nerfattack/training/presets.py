@@ -47,14 +47,18 @@ class Preset:
 #: Beside the small car's track, in its scale: cubes of 0.15 to 0.35 m.
 _ROOM_ROADSIDE = Roadside(((0.15, 0.35),), gap_m=(0.05, 0.6), clearance_m=0.05)
 
-#: The small car's track: a tenth of the lengths of the intersection.
-_ROOM = CollectSettings(
-    spread_m=0.3,
-    ahead_m=1.6,
-    margin_m=0.2,
-    scatter=Scatter(lateral_sd_m=0.08, lateral_max_m=0.2),
-    roadside=_ROOM_ROADSIDE,
-)
+#: How frames are drawn, by bundled place. The lengths of the small car's track are a
+#: tenth of those of the intersection.
+COLLECTIONS: Mapping[str, CollectSettings] = {
+    "intersection": CollectSettings(),
+    "room": CollectSettings(
+        spread_m=0.3,
+        ahead_m=1.6,
+        margin_m=0.2,
+        scatter=Scatter(lateral_sd_m=0.08, lateral_max_m=0.2),
+        roadside=_ROOM_ROADSIDE,
+    ),
+}
 
 #: Presets by name. "intersection" and "room" have the figures of appendix B.3 and B.4;
 #: the room's 9,584 frames of the real car are path-traced ones here.
@@ -76,7 +80,7 @@ PRESETS: Mapping[str, Preset] = {
         {"mitsuba": 9_584, "surrogate": 12_000},
         epochs=10,
         weather=Weather(exposures_ev=ANY_WEATHER.exposures_ev),
-        collecting=_ROOM,
+        collecting=COLLECTIONS["room"],
     ),
 }
 
@@ -103,8 +107,18 @@ def evaluation_for(car_width_m: float) -> EvaluateSettings:
     Starts that scatter, and objects that stand, as for a full-size car leave no lane of
     a small one free.
     """
-    known = EVALUATIONS.values()
-    return min(known, key=lambda settings: abs(settings.car_width_m - car_width_m))
+    return EVALUATIONS[_most_similar(car_width_m)]
+
+
+def collecting_for(car_width_m: float) -> CollectSettings:
+    """Return how to draw frames at such a place; see `evaluation_for`."""
+    return COLLECTIONS[_most_similar(car_width_m)]
+
+
+def _most_similar(car_width_m: float) -> str:
+    """Return the bundled place whose car has the most similar width."""
+    widths = {name: settings.car_width_m for name, settings in EVALUATIONS.items()}
+    return min(widths, key=lambda name: abs(widths[name] - car_width_m))
 
 
 def find_preset(name: str) -> Preset:

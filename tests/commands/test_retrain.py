@@ -16,8 +16,11 @@ from safetensors.torch import save_file
 
 import mi_nerfattack as nf
 from mi_nerfattack import cli
+from mi_nerfattack.commands.retrain import Retrain
+from mi_nerfattack.deploy.place import bundled_place
 from mi_nerfattack.experiment.transfer.found import read_found
 from mi_nerfattack.io import files
+from mi_nerfattack.scenario.policy.kinds import HttpSection
 from mi_nerfattack.scenario.user_code import load_function
 from tests.faults import worlds
 
@@ -143,3 +146,15 @@ def test_what_cannot_be_trained_is_refused_before_a_drive(
     error = capsys.readouterr().err
     assert len([*re.finditer(message, error)]) == 1, error
     assert not (tmp_path / "new").exists()
+
+
+def test_frames_and_starts_have_the_scale_of_the_car():
+    """A lane of the room is narrower than the scatter of a full-size car."""
+    policy = HttpSection(kind="http", url="http://127.0.0.1:1")
+    for name, share in (("intersection", 1.0), ("room", 0.2)):
+        place = bundled_place(name)
+        settings = Retrain((), Path("new"), Path("data"))._settings(policy, place)
+        frames, starts = settings.collecting.scatter, settings.final.scatter
+        assert frames.lateral_max_m < share * 1.6 and starts.lateral_max_m < share * 1.6
+        assert settings.final.car_width_m == place.car.width
+        assert settings.collecting.shard == 32
