@@ -103,6 +103,7 @@ class Retrain:
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.experiment.retrain.among import FramesAmong
+        from mi_nerfattack.experiment.retrain.anew import check_scenarios
         from mi_nerfattack.experiment.retrain.compare import (
             AFTER,
             BEFORE,
@@ -123,6 +124,8 @@ class Retrain:
         order = self._order(policy, training)
         old_shards = find_shards(*self.more)
         groups, others = self._groups(attacks)
+        if self.adaptive:
+            check_scenarios(groups[OLD])
         settings = self._settings(policy.attacked, place)
         sites = self._sites(place, settings, attacks[0].scenario.vehicle)
         workers = self._workers(policy.attacked)

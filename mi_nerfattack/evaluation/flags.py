@@ -24,6 +24,9 @@ HARDLY = 0.001
 #: A gradient misleads where the real gain is less than this share of the predicted one.
 LEAST_SHARE = 0.01
 
+#: Keys of `[attack.freedom]` that random textures do not keep.
+_LIMITS = ("linf", "l2", "lowest", "highest", "gamut", "fixed_m", "total_variation")
+
 #: `frames` rendered, increasing, and the least `objective` until then, a number each.
 Curve = Mapping[str, Sequence[float]]
 
@@ -50,10 +53,10 @@ def run_flags(
     curve = document.get("curve")
     attack = document.get("scenario", {}).get("attack", {})
     method = attack.get("method", {})
-    # Random textures are judged without the penalty that is in the curve
-    is_penalised = bool(attack.get("freedom", {}).get("total_variation"))
+    # Random textures keep no limit, and are judged without the penalty of the curve
+    is_limited = any(attack.get("freedom", {}).get(name) for name in _LIMITS)
     opens = method.get("opening", "none") != "none"
-    incomparable = is_penalised or (opens and _ends_early(document))
+    incomparable = is_limited or (opens and _ends_early(document))
     if by_gradient and curve is not None and not incomparable:
         looks = _random_curve(curve["frames"][0], document["baseline"]["objectives"])
         yield from black_box_better(curve, {"random textures": looks})

@@ -206,9 +206,9 @@ class RandomMethod(AbstractSearchMethod):
     texture_kind: Literal["noise", "blobs", "flat", "mixed"] = "mixed"
 
     def search(self, task: Task) -> AbstractSearch:
-        fields = task.fields
         seed = task.seed + (1 << 31)  # other draws than those of the baseline
-        return RandomSearch(RandomLooks(fields, task.freedom, self.texture_kind, seed))
+        looks = RandomLooks(task.fields, task.freedom, self.texture_kind, seed)
+        return RandomSearch(looks, task.colourings)
 
 
 class BlockMethod(AbstractSearchMethod):

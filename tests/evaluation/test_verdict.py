@@ -210,6 +210,16 @@ def test_random_looks_that_find_more_are_an_alarm_on_gradients_alone(document):
     check(document, "")
 
 
+def test_random_textures_without_limits_say_nothing_of_a_limited_attack(document):
+    document["baseline"]["objectives"][1] = -9.0
+    freedom = {"linf": None, "lowest": None, "fixed_m": [], "total_variation": 0.0}
+    document["scenario"] = {"attack": {"freedom": freedom, "method": {}}}
+    check(document, "black box better")
+    for limit in ({"linf": 0.1}, {"l2": 0.1}, {"lowest": 0.2}, {"gamut": "cmyk.icc"}):
+        document["scenario"]["attack"]["freedom"] = freedom | limit
+        check(document, "")
+
+
 def test_methods_are_compared_at_frames_that_both_reach():
     gradient = curve([10, 30, 50], [0.0, -3.0, -4.0])
     blocks = curve([10, 20, 30, 40], [-1.0, -2.0, -3.5, -9.0])

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from mi_nerfattack.backend.arrays import allocated_bytes
+from mi_nerfattack.experiment.checks import cost as module
 from mi_nerfattack.experiment.checks.cost import backgrounds_mb, estimate
 from mi_nerfattack.rollout.adjoint import KeptBackgrounds
 from mi_nerfattack.rollout.function import Rollout
@@ -47,3 +48,13 @@ def test_a_drive_may_be_longer_than_what_is_timed(scenario_folder, setting):
     cost = estimate(world, {})
     assert cost.horizon == 12
     assert cost.period_s["forward"] > 0 and cost.period_s["backward"] > 0
+
+
+def test_each_method_has_its_own_cost_of_a_backward_pass(scenario_folder, monkeypatch):
+    """Times of drives come from another method of the place, those of passes do not."""
+    scenario, _ = load_scenario(scenario_folder / "scenario.toml")
+    world = build_world(scenario, scenario.build_policy())
+    others = {"surrogate": 1.0, "forward": 1.0, "backward": 1.4}
+    monkeypatch.setattr(module, "_iteration", lambda world: (1.0, 3.0, 0.0, 0.0))
+    period_s = estimate(world, others).period_s
+    assert period_s == {"surrogate": 1.0, "forward": 1.0, "backward": 3.0}

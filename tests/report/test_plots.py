@@ -157,6 +157,11 @@ def test_rows_show_the_same_places():
     places, (steps,) = strip.aligned_steps(square, [lap], 4)
     np.testing.assert_allclose(places, [0, 20, 40, 60])
     assert steps == [0, 20, 40, 60]
+    # a start just before the first point of the route is near it, not a lap further
+    drives = [drive_at(square.pose_at(x + np.arange(22.0))) for x in (-0.02, 0.02)]
+    places, steps = strip.aligned_steps(square, drives, 3)
+    np.testing.assert_allclose(places, [-0.02, 9.99, 20.0], atol=0.03)
+    assert steps == [[0, 10, 20]] * 2
 
 
 def test_tiles_stand_row_by_row_under_their_titles():

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_nerfattack.attack.base import Freedom
-from mi_nerfattack.attack.black_box.search import AbstractSearch, Proposal
+from mi_nerfattack.attack.black_box.search import AbstractSearch, Proposal, propose
+from mi_nerfattack.attack.texture.colours import Colours
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.random_textures import random_texture
@@ -59,22 +60,29 @@ class RandomSearch(AbstractSearch):
 
     Args:
         looks: the draws.
+        colourings: of the objects. Where they limit colours, a draw moves to the
+            nearest colours that are allowed, and has their penalty.
 
     Raises:
         InputError: they leave textures alone.
     """
 
-    def __init__(self, looks: RandomLooks) -> None:
+    def __init__(self, looks: RandomLooks, colourings: Sequence[Colours] = ()) -> None:
         if looks.freedom.texture_rate is None:
             raise InputError("RandomSearch: textures may not change")
         self.looks = looks
+        self.colourings = colourings
         self._number = 0
 
     def ask(self) -> Proposal:
         """See :meth:`AbstractSearch.ask`."""
         textures = self.looks.textures(self._number)
         assert textures is not None  # textures may change
-        return Proposal(textures)
+        if not any(colouring.is_limited for colouring in self.colourings):
+            return Proposal(textures)
+        pairs = zip(self.colourings, textures, strict=True)
+        colours = [colouring.near(texture) for colouring, texture in pairs]
+        return propose(self.colourings, colours)
 
     def tell(self, objective: float) -> None:
         """See :meth:`AbstractSearch.tell`."""

@@ -128,6 +128,11 @@ class Colours(AbstractColouring):
         self._raw = _logit(colours)
         self.start: np.ndarray = self._allowed.start
 
+    @property
+    def is_limited(self) -> bool:
+        """Whether some colours are not allowed, or cost a penalty."""
+        return self._allowed.constraints.is_limit
+
     def texture(self, value: np.ndarray) -> np.ndarray:
         """See :meth:`AbstractColouring.texture`."""
         # Levels add up before the sigmoid, so one level can take the whole change

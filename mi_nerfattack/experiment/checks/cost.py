@@ -111,7 +111,7 @@ def estimate(world: World, drive_s: Mapping[str, float]) -> Cost:
         wall_s=wall,
         memory_mb=peak_memory_mb() + backgrounds_mb(world),
         disk_mb=disk + _PICTURES_MB,
-        period_s={"forward": forward, "backward": backward, **drive_s},
+        period_s={**drive_s, "forward": forward, "backward": backward},
     )
 
 

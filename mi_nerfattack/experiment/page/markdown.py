@@ -36,7 +36,7 @@ from mi_nerfattack.experiment.transfer.figures import (
     read_document,
 )
 from mi_nerfattack.io import files
-from mi_nerfattack.report.pages.sections import markdown_table
+from mi_nerfattack.report.pages.sections import escaped, markdown_table
 from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT, RANDOM
 from mi_nerfattack.scenario.deployment import SURROGATE
 
@@ -155,7 +155,9 @@ def _flags(summary: Figures) -> Iterator[str]:
     for failed in summary["failed"]:
         kinds.setdefault("failed", []).append(f"{failed['cell']}: {failed['error']}")
     if kinds:
-        rows = [(kind, *_how_often(texts)) for kind, texts in kinds.items()]
+        rows = [
+            (kind, *map(escaped, _how_often(texts))) for kind, texts in kinds.items()
+        ]
         yield markdown_table(["flag", "how often", "the first one"], rows)
 
 
@@ -168,28 +170,30 @@ def _how_often(texts: Sequence[str]) -> tuple[str, str]:
 def _rows(
     summary: Figures, environment: str, compared: bool
 ) -> Iterator[Sequence[str]]:
-    """Yield a row for each method on each route, then on all routes."""
+    """Yield a row for each method and budget on each route, then on all routes."""
     groups = {
-        (group["route"], group["method"], group["case"]): group
+        (group["route"], group["method"], group["budget"], group["case"]): group
         for group in summary["groups"]
         if group["environment"] == environment
     }
+    names = "route", "method", "budget", "other_method", "other_case"
     effects = {
-        (row["route"], row["method"], row["other_method"], row["other_case"]): row
+        tuple(row[name] for name in names): row
         for row in summary["comparisons"]
         if row["environment"] == environment
     }
-    for (route, method, case), attack in groups.items():
+    for (route, method, budget, case), attack in groups.items():
         if case != ATTACK:
             continue
+        labels = route, method, budget
         others = [(method, RANDOM), *[(GRADIENT, ATTACK)] * compared]
         yield (
             route or "all",
             method,
             f"{attack['frames']:.0f}",
-            *(cell(groups.get((route, method, name)), name) for name in CASES),
+            *(cell(groups.get((*labels, name)), name) for name in CASES),
             out(attack),
-            *(ratio(effects.get((route, method, *other))) for other in others),
+            *(ratio(effects.get((*labels, *other))) for other in others),
         )
 
 
@@ -243,7 +247,7 @@ def settings(tuning: Figures, methods: Sequence[str]) -> str:
     }
     rows = []
     for method in methods:
-        own = [name for name in errors if name.startswith(f"{method}_")]
+        own = [name for name in errors if _method_of(name, methods) == method]
         for name in own:
             best = all(means.get(name, 0) >= means.get(n, 9e9) for n in own)
             cells = [*(errors[name].get(r) for r in routes), means.get(name)]
@@ -251,6 +255,12 @@ def settings(tuning: Figures, methods: Sequence[str]) -> str:
             rows.append((method, name, *texts, "chosen" if best else ""))
     header = ("method", "setting", *routes, "geometric mean", "")
     return f"## Settings\n\n{markdown_table(header, rows)}"
+
+
+def _method_of(setting: str, methods: Sequence[str]) -> str:
+    """Return the longest name of a method that the name of a setting begins with."""
+    own = [method for method in methods if setting.startswith(f"{method}_")]
+    return max(own, key=len, default="")
 
 
 def _provenance(summary: Figures, made: Figures) -> str:

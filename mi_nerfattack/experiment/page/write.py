@@ -252,7 +252,8 @@ def _by_limit(scratch: Path, contents: PageContents) -> dict[str, Path]:
 def _attacked(contents: PageContents) -> Iterator[tuple[str, Mapping[str, Any], float]]:
     """Yield line, section `attack` and mean error of every attack in an environment.
 
-    A line is of one route, environment and method; of a sweep, of one kind of objects.
+    A line is of one route, environment and method; of a sweep, of one kind of objects
+    and one budget.
     """
     for run in contents.runs:
         section = run.document["scenario"]["attack"]
@@ -264,5 +265,7 @@ def _attacked(contents: PageContents) -> Iterator[tuple[str, Mapping[str, Any], 
     for sweep in contents.sweeps:
         for row in sweep.attacks:
             if ATTACK in row["cases"] and row["section"] is not None:
-                words = (row[k] for k in ("route", "objects", "environment", "method"))
+                words = [row[k] for k in ("route", "objects", "environment", "method")]
+                if row["budget"] is not None:
+                    words.append(f"{row['budget']:.0f} frames")
                 yield ", ".join(words), row["section"], row["cases"][ATTACK]

@@ -170,7 +170,8 @@ def write_frames(
         on_progress: called after every time step with stage, steps and a remark.
     """
     world, nominal = done.world, nominal_drives(done.drives, done.looks)
-    places, passed = aligned_steps(world.route, nominal, STRIP_FRAMES)
+    start_m = world.scenario.drive.start_m
+    places, passed = aligned_steps(world.route, nominal, STRIP_FRAMES, start_m)
     rows: dict[str, list[np.ndarray]] = {}
     digests, count = world.scenario.digests(), 0
     total = sum(len(drive.controls) + 1 for drive in nominal)

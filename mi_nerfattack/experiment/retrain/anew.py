@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.retrain.compare import read_with_policy
 from mi_nerfattack.experiment.sweep.cell import Cell, folder_of
 from mi_nerfattack.experiment.sweep.grid import axis_name
@@ -34,7 +35,7 @@ def attack_anew(
     interrupted attack goes on from its checkpoint.
 
     Args:
-        attacks: whose scenarios are attacked.
+        attacks: whose scenarios are attacked, see `check_scenarios`.
         policy: that is attacked, see `compare.with_policy`.
         folder: of the cells; made if missing.
         workers: who does them.
@@ -60,6 +61,23 @@ def attack_anew(
         every = range(len(cells))
         workers.run(Cells(cells, folder), every, lambda units: None, on_end)
     return list(read_found([folder_of(folder, cell) for cell in cells]))
+
+
+def check_scenarios(attacks: Sequence[FoundAttack]) -> None:
+    """Refuse runs of one scenario: the attack that is made again is the same for both.
+
+    Raises:
+        InputError: there are such runs.
+    """
+    folders: dict[str, Path] = {}
+    for attack in attacks:
+        digest = attack.scenario.digests()["scenario"]
+        first = folders.setdefault(digest, attack.folder)
+        if first != attack.folder:
+            raise InputError(
+                f"{attack.folder}: its scenario is that of {first}, so an attack that "
+                "is made again is the same for both; leave out one of the runs"
+            )
 
 
 def _cell(attack: FoundAttack, policy: str) -> Cell:

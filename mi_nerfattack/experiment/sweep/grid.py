@@ -301,7 +301,8 @@ class GridReader:
                 "count a backward pass as so many drives: check of a grid without "
                 "budgets measures it"
             )
-        iterations = int(budget / ((1 + multiple) * frames))
+        # 1 + 1.1 is a little more than 2.1, and must not cost an iteration
+        iterations = int(budget / ((1 + multiple) * frames) + 1e-9)
         if not iterations:
             raise InputError(
                 f"{self.path}: budgets: {budget} frames; an iteration of "

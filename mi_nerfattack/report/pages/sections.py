@@ -67,9 +67,9 @@ def markdown(title: str, lead: str, sections: Sections) -> str:
         lead: below the title.
         sections: content by title.
     """
-    paragraphs = [f"# {_escaped(title)}", _escaped(lead)]
+    paragraphs = [f"# {escaped(title)}", escaped(lead)]
     for name, blocks in sections.items():
-        paragraphs += [f"## {_escaped(name)}", *map(_as_markdown, blocks)]
+        paragraphs += [f"## {escaped(name)}", *map(_as_markdown, blocks)]
     return "\n\n".join(paragraphs) + "\n"
 
 
@@ -80,15 +80,15 @@ def code(value: str) -> Markup:
 
 def _as_markdown(block: Block) -> str:
     if isinstance(block, str):
-        return _escaped(block)
+        return escaped(block)
     if isinstance(block, Picture):
-        return f"![{_escaped(block.title)}]({_escaped(block.path.name)})"
+        return f"![{escaped(block.title)}]({escaped(block.path.name)})"
     if isinstance(block, Mapping):
         lines = [("", ""), *block.items()]
     else:
         lines = [[column.header for column in (*block.labels, *block.shown)]]
         lines += [[*names, *(c.text for c in cells)] for _, names, cells in block.body]
-    header, *rows = [list(map(_escaped, cells)) for cells in lines]
+    header, *rows = [list(map(escaped, cells)) for cells in lines]
     return markdown_table(header, rows)
 
 
@@ -103,5 +103,6 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
-def _escaped(text: object) -> str:
+def escaped(text: object) -> str:
+    """Return the text of a cell of a table in Markdown; its markup stays."""
     return text if isinstance(text, Markup) else str(text).translate(_IN_MARKDOWN)

@@ -160,7 +160,7 @@ def first_person_strip(
 
 
 def aligned_steps(
-    route: Route, drives: Sequence[Drive], count: int
+    route: Route, drives: Sequence[Drive], count: int, start_m: float = 0.0
 ) -> tuple[np.ndarray, list[list[int]]]:
     """Choose the steps at which drives pass the same places on their route.
 
@@ -168,6 +168,7 @@ def aligned_steps(
         route: of all drives.
         drives: at least one.
         count: of places, equally spaced from the first start to the farthest end.
+        start_m: arc length near which all drives start.
 
     Returns:
         the places, arc lengths (count,) in metres; and of each drive the step nearest
@@ -175,7 +176,9 @@ def aligned_steps(
     """
     arcs = [route.project_numpy(drive.states[:-1]).arc_length for drive in drives]
     if route.closed:
-        arcs = [np.unwrap(arc, period=route.length) for arc in arcs]
+        lap, arcs = route.length, [np.unwrap(arc, period=route.length) for arc in arcs]
+        # A start just before the beginning of the route is not a lap further
+        arcs = [arc - lap * np.round((arc[0] - start_m) / lap) for arc in arcs]
     low, high = min(arc[0] for arc in arcs), max(arc.max() for arc in arcs)
     places, steps = np.linspace(low, high, count), []
     for arc in arcs:

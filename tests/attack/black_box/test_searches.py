@@ -89,6 +89,22 @@ def floor() -> float:
     return attacked("random").curve()[-1, 1]
 
 
+def test_random_textures_of_a_search_keep_the_limits():
+    fields = grey()
+    limits = Constraints(linf=0.05, total_variation=2.0)
+    limited = [Colours(field, constraints=limits) for field in fields]
+    looks = RandomLooks(fields, Freedom(0.3), "mixed", 1)
+    proposal = RandomSearch(looks, limited).ask()
+    fields[0].set_parameter("texture", proposal.textures[0])
+    colours = vertex_colours(fields[0], fields[0].levels()[-1])
+    change = np.abs(colours - limited[0].start)
+    assert 0.04 < change.max() < 0.0501 and proposal.penalty > 0
+    fields[0].set_parameter("texture", np.zeros_like(proposal.textures[0]))
+    free = RandomSearch(looks, [Colours(field) for field in fields]).ask()
+    np.testing.assert_array_equal(free.textures[0], looks.textures(0)[0])
+    assert free.penalty == 0
+
+
 @pytest.mark.parametrize("kind", ["blocks", "separable", "learning_rate"])
 def test_searches_get_nearer(kind, floor):
     """Evolution nearer than the best random texture, blocks than the first ones."""

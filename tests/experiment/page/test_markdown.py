@@ -110,6 +110,44 @@ def test_a_case_that_is_not_driven_leaves_its_cells_empty(left, tmp_path):
     assert f"| day {cells}" in page.read_text()
 
 
+def group(method, budget, error, **others):
+    """Return a group of a summary, of an attack on a right turn."""
+    labels = {"route": "right", "method": method, "budget": budget}
+    labels |= {"environment": "surrogate", "case": "attack", "frames": budget or 9.0}
+    figures = {"cross_track_mean_m": error, "cross_track_mean_ci95_m": None}
+    return labels | figures | {"attacks_out": 0, "attacks": 1} | others
+
+
+def test_each_budget_has_its_row():
+    summary = {
+        "groups": [group("gradient", b, e) for b, e in ((1000, 0.2), (6000, 0.9))],
+        "comparisons": [],
+    }
+    table = list(markdown._rows(summary, "surrogate", compared=False))
+    assert [row[2] for row in table] == ["1000", "6000"]
+    assert all(
+        error in row for error, row in zip(("0.200", "0.900"), table, strict=True)
+    )
+
+
+def test_a_refusal_in_several_lines_is_one_row():
+    failed = {"cell": "a", "error": "would prove nothing:\n  an | object\nmend it"}
+    summary = {"complete": 0, "cells": 1, "flags": [], "failed": [failed]}
+    *_, table = markdown._flags(summary)
+    assert table.splitlines()[-1].endswith("nothing:   an \\| object mend it |")
+    assert len(table.splitlines()) == 3
+
+
+def test_a_setting_belongs_to_the_longest_name_of_a_method():
+    names = "gradient_1", "gradient_2", "gradient_attached_0"
+    pairs = zip(names, (0.2, 0.1, 0.9), strict=True)
+    groups = [group(name, None, error) for name, error in pairs]
+    text = markdown.settings({"groups": groups}, ["gradient", "gradient_attached"])
+    rows = [line.split(" | ") for line in text.splitlines()[4:]]
+    chosen = [row[1] for row in rows if "chosen" in row[-1]]
+    assert len(rows) == 3 and chosen == ["gradient_1", "gradient_attached_0"]
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_budgets_have_the_attacks_of_table_2():

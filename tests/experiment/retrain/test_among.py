@@ -26,7 +26,7 @@ from mi_nerfattack.experiment.retrain.among import (
     attacked_objects,
     found_place,
 )
-from mi_nerfattack.experiment.retrain.anew import attack_anew
+from mi_nerfattack.experiment.retrain.anew import attack_anew, check_scenarios
 from mi_nerfattack.experiment.retrain.solvable import drive_expert
 from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.fields import GridField, load_grid, save_field
@@ -255,6 +255,13 @@ def test_a_second_process_is_refused_before_it_attacks_anew(tmp_path):
     with locks.exclusive(tmp_path), pytest.raises(InputError, match="another process"):
         attack_anew([], "policy.file=absent", tmp_path, nothing)
     assert not list(tmp_path.iterdir())
+
+
+def test_runs_of_one_scenario_are_not_attacked_anew(attacks):
+    check_scenarios(attacks)
+    again = dataclasses.replace(attacks[0], folder=Path("again"))
+    with pytest.raises(InputError, match="again: its scenario is that of .*leave out"):
+        check_scenarios([*attacks, again])
 
 
 def test_each_attack_anew_has_a_process_of_its_own(tmp_path, monkeypatch):

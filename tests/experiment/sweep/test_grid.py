@@ -175,6 +175,15 @@ def test_a_method_has_a_multiple_of_its_own(write_grid):
     assert lengths(own) == {None, 2, 1}
 
 
+def test_no_iteration_is_lost_by_rounding(write_grid):
+    """20 iterations of 4 frames, each with 2.1 drives: 168 frames."""
+    new = "budgets = [168]\nbackward_multiple = 1.1"
+    cells = load_cells(write_grid(("budgets = [40]\nbackward_multiple = 1.5", new)))
+    near = [cell for cell in cells if (cell.route, cell.method) == ("near", "gradient")]
+    attacks = [parse_toml("cell", cell.text)["attack"] for cell in near]
+    assert {attack["method"]["max_iterations"] for attack in attacks} == {20}
+
+
 def test_a_grid_without_end_is_refused(write_grid, monkeypatch):
     monkeypatch.setattr(module, "MOST_CELLS", 11)
     with pytest.raises(InputError, match="11 cells"):
