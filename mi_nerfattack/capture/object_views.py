@@ -74,7 +74,7 @@ class Placement:
         if faces is not None:
             pictures = {
                 name: np.ascontiguousarray(
-                    files.read_image(faces / f"{name}.png")[..., :3]
+                    files.read_image(faces / f"{name}.png", as_shown=True)[..., :3]
                 )
                 for name in CUBE_FACES
             }

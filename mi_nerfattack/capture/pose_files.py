@@ -118,6 +118,8 @@ def _csv_rows(path: Path) -> list[dict[str, Any]]:
     if not lines:
         raise InputError(f"{path}: empty; needs a line of column names")
     header = [name.strip() for name in lines[0]]
+    if twice := sorted({name for name in header if header.count(name) > 1}):
+        raise InputError(f"{path}: {', '.join(twice)}: named twice; take one out")
     for number, line in enumerate(lines[1:]):
         if len(line) != len(header):
             raise InputError(
@@ -135,6 +137,12 @@ def _from_rows(
 ) -> PoseTable:
     if not rows:
         raise InputError(f"{path}: no frames; needs a row for each")
+    known = ("time_s", "file", *VEHICLE_KEYS, *CAMERA_KEYS)
+    if unknown := sorted({key for row in rows for key in row} - set(known)):
+        raise InputError(
+            f"{path}: {', '.join(unknown)}: unknown; a frame has time_s, file and a "
+            "pose: correct the name, or take it out"
+        )
     poses = []
     for index, row in enumerate(rows):
         where = f"{path}: row {index}"

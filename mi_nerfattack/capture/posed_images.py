@@ -146,7 +146,8 @@ def load_images(
 
     Returns:
         n images (height, width, 3 or 4), uint8 sRGB, as `stacked` puts them together,
-        and one camera per image in their pixels.
+        and one camera per image in their pixels. Alpha that is 255 everywhere is left
+        out.
 
     Raises:
         InputError: an image cannot be read, or its size is not that of its camera.
@@ -165,7 +166,9 @@ def load_images(
             )
         target = _reduced(camera, long_edge_px)
         result.append(resize_area(image, target.width, target.height))
-    if len({image.shape[2] for image in result}) > 1:
+    if all(image.shape[2] == 3 or (image[..., 3] == 255).all() for image in result):
+        result = [image[..., :3] for image in result]
+    elif len({image.shape[2] for image in result}) > 1:
         result = [_with_alpha(image) for image in result]
     return stacked(result), tuple(_reduced(c, long_edge_px) for c in cameras)
 

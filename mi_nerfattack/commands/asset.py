@@ -270,7 +270,7 @@ class AssetFlat:
     def run(self) -> Result:
         """Read the picture and write the field."""
         from mi_nerfattack import variant
-        from mi_nerfattack.capture.mesh.flat import FlatObject
+        from mi_nerfattack.capture.mesh.flat import FlatObject, read_picture
         from mi_nerfattack.fields.io import save_field
         from mi_nerfattack.io import files
 
@@ -282,7 +282,7 @@ class AssetFlat:
         variant.ensure()
         picture = None
         if self.picture is not None:
-            picture = files.read_image(self.picture)[..., :3]
+            picture = read_picture(self.picture)
         save_field(self.output, flat.field(picture))
         message = (
             f"Wrote {self.output}: {self.kind} of {self.width_m:g} x {self.height_m:g} "

@@ -133,8 +133,7 @@ class DriveCommand:
         rig.require_one(f"{name}", "the car has one: take a policy of one")
         mount = rig.mounts[0]
         if config.camera_file is None and file is not None and file.vehicle is not None:
-            ahead = file.vehicle.car().reference  # the mount is ahead of this point
-            mount = dataclasses.replace(mount, forward_m=mount.forward_m + ahead)
+            mount = file.vehicle.car().from_axle(mount)
         return config, Trained(policy, rig.cameras[0], mount)
 
 

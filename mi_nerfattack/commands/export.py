@@ -90,8 +90,11 @@ class ExportFaces:
         from mi_nerfattack.io import files
 
         output = self.output
-        if output.suffix or output.is_file():
-            raise InputError(f"{output}: give a folder's name")
+        if output.is_file() or (output.suffix and not output.is_dir()):
+            raise InputError(
+                f"{output}: is the name of a file; give a folder's name without a "
+                "suffix, or make the folder before"
+            )
         files.check_folder(output)
         variant.ensure()
         faces = render_faces(load_grid(self.field), self.pixels_per_m)

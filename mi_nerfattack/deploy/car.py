@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import (
@@ -96,6 +96,13 @@ class Car:
     def control_names(self) -> tuple[str, ...]:
         """Names of the controls, in their order."""
         return control_names(self.control_unit, self.more_controls)
+
+    def from_axle(self, mount: CameraMount) -> CameraMount:
+        """Return a mount on the car's point as one on the middle of the rear axle.
+
+        Trackers, and recordings of real drives, have poses of the latter.
+        """
+        return replace(mount, forward_m=mount.forward_m + self.reference)
 
     def __post_init__(self) -> None:
         if self.control_unit == "rad" and self.max_control > self.max_steer:

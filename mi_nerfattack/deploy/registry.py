@@ -134,7 +134,7 @@ def _replay(place: Place, conditions: Conditions) -> AbstractEnvironment:
     recording = open_recording(
         place.recording,
         place.camera,
-        place.mount,
+        place.car.from_axle(place.mount),
         period=place.period,
         topics=McapTopics.parse(place.topics),
     )

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from mi_nerfattack.deploy.car import Car
 from mi_nerfattack.deploy.replay.environment import open_recording
 from mi_nerfattack.deploy.replay.mcap import McapTopics
 from mi_nerfattack.deploy.replay.recording import vehicle_states
@@ -40,10 +41,12 @@ class Course:
         end_m: where one at the vehicle's speed ends.
         lane: of the route.
         camera: of the scenario, for recordings without intrinsics.
-        mount: of the camera on the vehicle.
+        mount: of the camera on the vehicle, from the point of its state.
+        on_axle: the same, from the middle of the rear axle.
+        reference: how far ahead of this axle the point is, metres.
         period: seconds between two controls.
-        control_unit: "rad" of a steering angle; drives have heading rates of others.
-        wheelbase: metres.
+        car: of the scenario. Drives have steering angles, where these are its control
+            (rad), and otherwise heading rates.
     """
 
     route: Route
@@ -53,8 +56,7 @@ class Course:
     camera: Camera
     mount: CameraMount
     period: float
-    control_unit: str
-    wheelbase: float
+    car: Car
 
     @classmethod
     def of(cls, attack: FoundAttack) -> Course:
@@ -75,8 +77,7 @@ class Course:
             camera=camera,
             mount=mount,
             period=period,
-            control_unit=car.control_unit,
-            wheelbase=car.wheelbase,
+            car=car,
         )
 
     @property
@@ -112,17 +113,20 @@ class Course:
             times: (n,), seconds, increasing.
 
         Returns:
-            (n - 1,), radians of steering if that is `control_unit`, else radians per
+            (n - 1,), radians of steering if that is the car's control, else radians per
             second of heading; positive to the left.
 
         Source: appendix A.7 and A.8.
         """
         turn = np.diff(states[:, 2])
         turn = np.arctan2(np.sin(turn), np.cos(turn))
-        if self.control_unit != "rad":
+        car = self.car
+        if car.control_unit != "rad":
             return turn / np.diff(times)
-        way = np.hypot(*np.diff(states[:, :2], axis=0).T)
-        return steering_angle(turn, way, self.wheelbase)
+        ahead = np.stack([np.cos(states[:, 2]), np.sin(states[:, 2])], 1)
+        axle = states[:, :2] - car.reference * ahead
+        way = np.hypot(*np.diff(axle, axis=0).T)
+        return steering_angle(turn, way, car.wheelbase)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,8 +204,9 @@ def read_real(
         InputError: it cannot be read, is in another frame of the world, is nowhere on
             the stretch, or has too few poses.
     """
+    mount = course.car.from_axle(course.mount)
     recording = open_recording(
-        path, course.camera, course.mount, period=course.period, topics=topics
+        path, course.camera, mount, period=course.period, topics=topics
     )
     with closing(recording):
         track, remarks = recording.track, recording.remarks

@@ -47,10 +47,10 @@ class Rendering:
         """The depth where the field stops half of the light, else infinity."""
         return np.where(self.opacity >= SOLID, self.depth, np.inf)
 
-    @property
-    def hazy(self) -> float:
-        """Share of rays whose opacity lies inside `HAZY`."""
-        return float(np.mean((self.opacity > HAZY[0]) & (self.opacity < HAZY[1])))
+    def hazy(self, mask: np.ndarray | None = None) -> float:
+        """Return the share of rays, of those in a mask, with opacity inside `HAZY`."""
+        opacity = self.opacity if mask is None else self.opacity[mask]
+        return float(np.mean((opacity > HAZY[0]) & (opacity < HAZY[1])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,10 +173,11 @@ class FieldRenderer:
         psnr, ssim = compare(shown.image, expected, mask)
         holes = float("nan")
         if depth is not None:
-            holes = self.holes(shown, camera, camera_to_world, depth=depth)
+            counted = depth if mask is None else np.where(mask, depth, np.nan)
+            holes = self.holes(shown, camera, camera_to_world, depth=counted)
         pictures = Pictures(expected, shown, depth)
         return ViewScore(
-            name, psnr, ssim, hazy=shown.hazy, holes=holes, pictures=pictures
+            name, psnr, ssim, hazy=shown.hazy(mask), holes=holes, pictures=pictures
         )
 
     def holes(

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageOps
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.extras import load_extra
@@ -101,17 +101,17 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     return parse_toml(path, read_text(path, MAX_TOML_BYTES))
 
 
-def read_image(path: str | Path) -> np.ndarray:
+def read_image(path: str | Path, as_shown: bool = False) -> np.ndarray:
     """Read a PNG, JPEG, WebP or HEIC image; see `decode_image`."""
-    return decode_image(path, read_bytes(path, MAX_IMAGE_BYTES))
+    return decode_image(path, read_bytes(path, MAX_IMAGE_BYTES), as_shown)
 
 
-def decode_image(path: str | Path, raw: bytes) -> np.ndarray:
+def decode_image(path: str | Path, raw: bytes, as_shown: bool = False) -> np.ndarray:
     """Decode the content of a PNG, JPEG, WebP or HEIC file; `path` is for messages.
 
-    The pixels come as they are stored: an EXIF orientation is not applied, since
-    calibrated poses refer to the stored grid. HEIC turns them by itself. Grey and
-    palette images become RGB.
+    The pixels come as they are stored, since calibrated poses refer to the stored grid;
+    `as_shown` turns them as their EXIF orientation says and as viewers do. HEIC turns
+    them by itself. Grey and palette images become RGB.
 
     Returns:
         sRGB values, uint8, (height, width, 3), or (height, width, 4) with alpha.
@@ -125,7 +125,8 @@ def decode_image(path: str | Path, raw: bytes) -> np.ndarray:
                 f"{path}: pixel type {image.mode}; use 8 bits a channel, grey or RGB"
             )
         mode = "RGBA" if image.has_transparency_data else "RGB"
-        return np.array(image.convert(mode), dtype=np.uint8)
+        shown = ImageOps.exif_transpose(image) if as_shown else image
+        return np.array(shown.convert(mode), dtype=np.uint8)
 
 
 def image_formats(path: str | Path, raw: bytes) -> tuple[str, ...]:

@@ -133,7 +133,7 @@ class Views:
 
     Attributes:
         camera: intrinsics.
-        mount: of the camera on the vehicle.
+        mount: of the camera on the vehicle, from the middle of the rear axle.
         camera_to_world: (n, 4, 4), OpenCV axes, metres; n is 0 without such drives.
         period: of the drives, seconds between two frames.
     """
@@ -249,7 +249,8 @@ def placed(attack: FoundAttack) -> tuple[list[Pose], Views]:
     ]
     states = np.concatenate([np.zeros((0, 3)), *driven])
     matrices, period = mount_matrix(states, mount), scenario.vehicle.dt_s
-    return poses, Views(camera, mount, matrices, period=period)
+    on_axle = scenario.vehicle.car().from_axle(mount)
+    return poses, Views(camera, on_axle, matrices, period=period)
 
 
 def box_pictures(

@@ -11,7 +11,6 @@ from pydantic import Field, model_validator
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, load_grid
-from mi_nerfattack.io import files
 from mi_nerfattack.ranges import Finite, Positive
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.scenario.named_file import File, NamedFile
@@ -99,7 +98,9 @@ class FlatObjectSection(AbstractObjectSection):
             return load_grid(saved)
         picture = None
         if self.picture is not None:
-            picture = files.read_image(self.picture.file)[..., :3]
+            from mi_nerfattack.capture.mesh.flat import read_picture
+
+            picture = read_picture(self.picture.file)
         return self._flat().field(picture)
 
     def _flat(self) -> FlatObject:

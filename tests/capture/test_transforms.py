@@ -76,6 +76,15 @@ class TestTransforms:
         assert back.camera == CAMERA
         assert json.loads((tmp_path / "transforms.json").read_text())["seed"] == 7
 
+    def test_alpha_without_transparency_is_left_out(self, tmp_path):
+        images, poses = some_frames(channels=4)
+        images[..., 3] = 255
+        write_transforms(tmp_path, images, CAMERA, poses)
+        np.testing.assert_array_equal(read_transforms(tmp_path).images, images[..., :3])
+        images[0, 0, 0, 3] = 254
+        write_transforms(tmp_path, images, CAMERA, poses)
+        assert read_transforms(tmp_path).channels == 4
+
     def test_rounded_matrices_become_rotations_again(self, folder):
         exact = read_transforms(folder).camera_to_world
 

@@ -229,6 +229,9 @@ def test_the_command_writes_both_kinds(tmp_path, capsys):
     assert document["size_m"] == pytest.approx([2, 1.6, 1.6])
     names = {f"{name}.png" for name in meshes.CUBE_FACES} | {"faces.json"}
     assert {path.name for path in faces.iterdir()} == names
+    (versioned := tmp_path / "v1.0").mkdir()
+    assert cli.main(["export", "faces", str(field), "-o", str(versioned)]) == 0
+    assert (versioned / "px.png").is_file()
 
 
 def test_cube_reads_its_pictures(tmp_path):

@@ -17,6 +17,7 @@ from support.files.runs import COST
 from support.worlds.attacks import write_scenario
 
 from mi_nerfattack import cli
+from mi_nerfattack.deploy.car import Car
 from mi_nerfattack.drives.spec import FORMAT, DriveSpec
 from mi_nerfattack.drives.store import Store
 from mi_nerfattack.drives.table import STEPS as COLUMNS
@@ -39,9 +40,8 @@ LINE = Route("line", 0, np.array([[-20.0, 0], [60, 0]]))
 
 def course_of(route: Route, start: float = 0.0, length: float = LENGTH, **changes):
     camera, mount = from_fov(16, 8, 90.0), CameraMount()
-    vehicle = {"control_unit": "rad/s", "wheelbase": 2.7} | changes
-    lane = Lane(0.85, 1.75)
-    return Course(route, start, start + length, lane, camera, mount, PERIOD, **vehicle)
+    car, lane = Car(max_control=0.7, **changes), Lane(0.85, 1.75)
+    return Course(route, start, start + length, lane, camera, mount, PERIOD, car)
 
 
 def beside(route: Route, arcs: np.ndarray, lateral: np.ndarray) -> np.ndarray:
@@ -104,6 +104,20 @@ def test_a_drive_is_cut_to_the_stretch(route, begin, end, tmp_path):
     ]
     # outside of a bend, the nearest place of the polygon is its vertex
     assert np.abs(np.subtract(*errors)).max() < 0.06
+
+
+def test_tracked_poses_are_of_the_rear_axle(tmp_path):
+    """The model's point is 1.35 m ahead: as far to the left as the heading says."""
+    arcs = np.arange(-3.0, 14.0, 0.3)
+    axle = LINE.pose_at(arcs, 0.0, np.full_like(arcs, 0.2))
+    course = course_of(LINE, reference=1.35, control_unit="rad")
+    cut = recorded(tmp_path, course, axle, 0.06)
+    np.testing.assert_allclose(cut.drive.cross_track_m, 1.35 * np.sin(0.2), atol=1e-6)
+    turn, radius = 0.01 * np.arange(20), 9.0
+    circle = np.stack([radius * np.sin(turn), radius * (1 - np.cos(turn)), turn], 1)
+    ahead = np.stack([np.cos(turn), np.sin(turn), 0 * turn], 1)
+    steered = course.controls(circle + 1.35 * ahead, 0.1 * np.arange(20))
+    np.testing.assert_allclose(steered, np.arctan(2.7 / radius), rtol=1e-3)
 
 
 def test_a_drive_that_never_comes_back(tmp_path):

@@ -314,6 +314,8 @@ def test_the_car_stands_on_its_rear_axle(run, monkeypatch, tmp_path):
     section = read_section("vehicle", VehicleSection, bicycle, tmp_path)
     scenario = attack.scenario.model_copy(update={"vehicle": section})
     other = replace(attack, scenario=scenario)
+    mounts = [attacked.placed(item)[1].mount.forward_m for item in (attack, other)]
+    assert mounts[1] - mounts[0] == pytest.approx(1.5)  # as trackers see it
     monkeypatch.setattr(openscenario, "read_found", lambda runs: [other])
     starts = []
     for folder in (tmp_path / "bicycle", tmp_path / "before"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from PIL import Image
@@ -12,6 +13,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import FLAT
 from mi_nerfattack.fields.grid import GridField, GridLayout
 from mi_nerfattack.fields.occupancy import Occupancy
+from mi_nerfattack.io import files
 
 #: Pixels along an edge, at most: the lattice of a grid field is a cube.
 MOST_PIXELS = 256
@@ -21,6 +23,24 @@ _MOST_M = 0.04  # and metres, at most
 _STEPS = 8  # of the march, through the sheet at right angles
 _STEP_DEPTH = 12.0  # optical depth of a step, which is opaque
 _RANGE = 1 / 512  # sRGB, from 0 and from 1, which no sigmoid reaches
+
+
+def read_picture(path: str | Path) -> np.ndarray:
+    """Read the picture of a flat object, as viewers show it.
+
+    Returns:
+        (h, w, 3), uint8 sRGB.
+
+    Raises:
+        InputError: it cannot be read, or pixels are transparent.
+    """
+    image = files.read_image(path, as_shown=True)
+    if image.shape[2] == 4 and image[..., 3].min() < 255:
+        raise InputError(
+            f"{path}: has transparent pixels, and a flat object is opaque; save the "
+            "picture on a background"
+        )
+    return image[..., :3]
 
 
 @dataclass(frozen=True)

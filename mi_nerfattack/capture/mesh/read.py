@@ -68,6 +68,7 @@ def load_mesh(path: str | Path, up: str | None = None) -> TexturedMesh:
         raise InputError(f"{path}: unknown suffix; use {', '.join(SUFFIXES)}")
     turn = up_matrix(up or ("z" if suffix == ".ply" else "y"))
     base_colours: tuple[BaseColour, ...] = ()
+    coloured: frozenset[str] = frozenset()
     chunks: dict[str, bytes] = {}
     resolver = _recording_resolver(path, chunks)
     if suffix in (".glb", ".gltf"):
@@ -81,7 +82,7 @@ def load_mesh(path: str | Path, up: str | None = None) -> TexturedMesh:
         data, kind = files.read_bytes(path, MAX_BYTES), suffix[1:]
     if kind == "obj":
         data = _as_utf8(data)
-        _check_materials(path, data, resolver)
+        coloured = _check_materials(path, data, resolver)
     with _as_input_error(path, resolver):
         scene = trimesh.load_scene(
             io.BytesIO(data), file_type=kind, resolver=resolver, process=False
@@ -93,7 +94,7 @@ def load_mesh(path: str | Path, up: str | None = None) -> TexturedMesh:
             transform, name = scene.graph[node]
             geometry = scene.geometry[name]
             if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
-                part = _read_part(geometry, base_colours)
+                part = _read_part(geometry, base_colours, coloured)
                 matrix, offset = turn @ transform[:3, :3], turn @ transform[:3, 3]
                 submeshes.append(part.placed(matrix, offset))
     return _checked(path, tuple(submeshes))
@@ -220,8 +221,12 @@ def _as_input_error(path: Path, resolver: Any) -> Iterator[None]:
         logger.setLevel(level)
 
 
-def _check_materials(path: Path, data: bytes, resolver: Any) -> None:
-    """Check that an OBJ's material library is there and defines what is used."""
+def _check_materials(path: Path, data: bytes, resolver: Any) -> frozenset[str]:
+    """Check that an OBJ's material library is there and defines what is used.
+
+    Returns:
+        names of the materials with a colour (Kd).
+    """
     lines = data.decode("utf-8", "replace").splitlines()
     words = [line.split(None, 1) for line in lines if line[:3] in ("mtl", "use")]
     named = [(word[0], word[1].strip()) for word in words if len(word) == 2]
@@ -232,15 +237,21 @@ def _check_materials(path: Path, data: bytes, resolver: Any) -> None:
             f"{path}: names several material libraries ({', '.join(libraries)}); "
             "merge them into one"
         )
-    defined = set()
+    defined: set[str] = set()
+    coloured: set[str] = set()
     if libraries:
         try:
             text = resolver.get(libraries[0]).decode("utf-8", "replace")
         except FileNotFoundError:
             _refuse_missing(path, resolver)
         else:
-            rows = [line.split() for line in text.splitlines()]
-            defined = {" ".join(r[1:]) for r in rows if r and r[0].lower() == "newmtl"}
+            name = ""
+            for row in filter(None, (line.split() for line in text.splitlines())):
+                if row[0].lower() == "newmtl":
+                    name = " ".join(row[1:])
+                    defined.add(name)
+                elif row[0].lower() == "kd":
+                    coloured.add(name)
     unknown = sorted(used - defined)
     if unknown:
         where = libraries[0] if libraries else "any library (it names none)"
@@ -248,9 +259,12 @@ def _check_materials(path: Path, data: bytes, resolver: Any) -> None:
             f"{path}: usemtl {unknown[0]!r} is not defined in {where}; add the "
             "material, or remove the usemtl lines for a grey object"
         )
+    return frozenset(coloured)
 
 
-def _read_part(geometry: Any, base_colours: tuple[BaseColour, ...]) -> MeshPart:
+def _read_part(
+    geometry: Any, base_colours: tuple[BaseColour, ...], coloured: frozenset[str]
+) -> MeshPart:
     # trimesh computes normals on demand; only those of the file are wanted, and its
     # cache alone tells which they are (its own glTF exporter asks there too)
     has_normals = "vertex_normals" in geometry._cache
@@ -265,7 +279,7 @@ def _read_part(geometry: Any, base_colours: tuple[BaseColour, ...]) -> MeshPart:
     if base_colours:
         return _with_base_colour(part, visual, base_colours[int(visual.material.name)])
     if visual.kind == "texture":
-        return _with_simple_material(part, visual)
+        return _with_simple_material(part, visual, coloured)
     if visual.kind == "vertex":
         colours = srgb_to_linear_numpy(_unit(visual.vertex_colors))[:, :3]
         return replace(part, vertex_colour=colours, colour=(1.0, 1.0, 1.0))
@@ -289,13 +303,25 @@ def _unit(colour: Any) -> np.ndarray:
     return colour.astype(np.float64) / full
 
 
-def _with_simple_material(part: MeshPart, visual: Any) -> MeshPart:
-    """Lay on a material of OBJ or PLY, whose colour is sRGB."""
+def _with_simple_material(
+    part: MeshPart, visual: Any, coloured: frozenset[str]
+) -> MeshPart:
+    """Lay on a material of OBJ or PLY, whose colour is sRGB.
+
+    A texture has its own colours, unless the file gives a colour that tints it.
+    """
     material = visual.material
     factor = srgb_to_linear_numpy(_unit(material.diffuse))
+    if material.image is not None and material.name not in coloured:
+        factor = np.ones(3)
     part = replace(part, colour=tuple(map(float, factor[:3])))
-    if material.image is None or visual.uv is None:
+    if material.image is None:
         return part
+    if visual.uv is None:
+        raise InputError(
+            f"a face with the texture of material {material.name!r} has no texture "
+            "coordinates (vt); give it coordinates, or a material without a texture"
+        )
     texture, uv, wrap = laid_out(
         flat_texture(material.image, "RGB"), np.array(visual.uv), ("repeat", "repeat")
     )

@@ -203,8 +203,8 @@ def side_by_side(images: Sequence[Any], layout: Layout) -> Any:
 def blur(value: Any, shape: tuple[int, ...], blurs: np.ndarray) -> Any:
     """Convolve images with Gaussians; differentiable.
 
-    Edges are mirrored, without their outermost pixel twice over: this makes the matrix
-    of the convolution symmetric, so that it is its own transpose.
+    Edges are mirrored, the outermost pixel too: this makes the matrix of the
+    convolution symmetric, so that it is its own transpose.
 
     Args:
         value: flat values of a tensor of that shape.

@@ -7,15 +7,17 @@ import json
 import mitsuba as mi
 import numpy as np
 import pytest
+from PIL import ExifTags, Image
 from support.faults.refusals import refusals
 
 from mi_nerfattack import cli
 from mi_nerfattack.backend.arrays import upload_rows
 from mi_nerfattack.backend.colour import srgb_to_linear_numpy
 from mi_nerfattack.capture.mesh.cube_faces import FLAT_FACES
-from mi_nerfattack.capture.mesh.flat import FlatObject
+from mi_nerfattack.capture.mesh.flat import FlatObject, read_picture
 from mi_nerfattack.capture.mesh.surface import field_surface
 from mi_nerfattack.deploy.built_in import make_built_in
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import load_grid, save_field
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.pose import Pose
@@ -134,6 +136,22 @@ test_refused = refusals(
     (lambda: FlatObject("patch", 1, 1, -3), "pixels_per_m: -3"),
     (lambda: FlatObject("patch", 1, 4, 100), "pixels_per_m: 100 .* 400 .* take 64 or"),
 )
+
+
+def test_a_picture_is_as_viewers_show_it(tmp_path):
+    """A photograph of a camera that was held upright is stored lying."""
+    tags = Image.Exif()
+    tags[ExifTags.Base.Orientation] = 6
+    stored = np.rot90(picture())  # to the left, so that viewers turn it to the right
+    Image.fromarray(stored).save(tmp_path / "a.png", exif=tags)
+    np.testing.assert_array_equal(read_picture(tmp_path / "a.png"), picture())
+    clear = np.dstack([picture(), np.full(picture().shape[:2], 254, np.uint8)])
+    files.write_image(tmp_path / "b.png", clear)
+    with pytest.raises(InputError, match="b.png: has transparent pixels"):
+        read_picture(tmp_path / "b.png")
+    clear[..., 3] = 255
+    files.write_image(tmp_path / "b.png", clear)
+    np.testing.assert_array_equal(read_picture(tmp_path / "b.png"), picture())
 
 
 def test_the_command_writes_the_same_field(tmp_path, capsys):

@@ -107,6 +107,31 @@ def test_obj(tmp_path):
     np.testing.assert_allclose(rgb, CORNERS, atol=3)
 
 
+@pytest.mark.parametrize(
+    ("kd", "shade"), [("", 1.0), ("Kd 0.5 0.5 0.5\n", 0.5)], ids=["none", "half"]
+)
+def test_a_texture_is_tinted_only_by_a_colour_of_the_file(tmp_path, kd, shade):
+    """The default of a material without a colour is grey, for parts without texture."""
+    four_colours().save(tmp_path / "four.png")
+    (tmp_path / "a.mtl").write_text(f"newmtl A\n{kd}map_Kd four.png\n")
+    (tmp_path / "a.obj").write_bytes(b"mtllib a.mtl\n" + UV.replace(b"W\xf6", b"A"))
+    (part,) = load_mesh(tmp_path / "a.obj").submeshes
+    expected = srgb_to_linear_numpy(np.array([shade] * 3))
+    np.testing.assert_allclose(part.colour, expected, atol=2e-3)
+    assert part.texture is not None
+
+
+def test_a_texture_of_ply_keeps_its_colours(tmp_path):
+    four_colours().save(tmp_path / "four.png")
+    head = "ply\nformat ascii 1.0\ncomment TextureFile four.png\nelement vertex 3\n"
+    names = "".join(f"property float {name}\n" for name in "x y z s t".split())
+    tail = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    rows = "0 0 0 0 0\n1 0 0 1 0\n1 1 0 1 1\n3 0 1 2\n"
+    (tmp_path / "a.ply").write_text(head + names + tail + rows)
+    (part,) = load_mesh(tmp_path / "a.ply").submeshes
+    assert part.texture is not None and part.colour == (1.0, 1.0, 1.0)
+
+
 class TestMaterials:
     @pytest.mark.parametrize(("dtype", "full"), [("f4", 1), ("u2", 65535), ("u1", 255)])
     def test_vertex_colours_are_linear_and_exact(self, tmp_path, dtype, full):
@@ -243,6 +268,12 @@ def test_gltf_files_that_are_refused(tmp_path, change, named):
         load_mesh(gltf.write(tmp_path / "in/a.glb"))
 
 
+def png() -> bytes:
+    stream = BytesIO()
+    Image.new("RGB", (4, 4), "red").save(stream, "PNG")
+    return stream.getvalue()
+
+
 def deep_png() -> bytes:
     stream = BytesIO()
     Image.fromarray(np.full((4, 4), 40000, np.uint16)).save(stream, "PNG")
@@ -268,6 +299,14 @@ PAINTED = {"a.obj": b"mtllib a.mtl\n" + UV, "a.mtl": b"newmtl W\xf6\nmap_Kd t.pn
         (PAINTED, "missing file 't.png'"),
         ({**PAINTED, "t.png": b"not a picture"}, "texture 't.png'"),
         ({**PAINTED, "t.png": deep_png()}, "texture: pixel type I;16"),
+        (
+            {
+                "a.obj": PAINTED["a.obj"].replace(b"1/1 2/2 3/3", b"1 2 3"),
+                "a.mtl": PAINTED["a.mtl"],
+                "t.png": png(),
+            },
+            "no texture coordinates",
+        ),
     ],
 )
 def test_other_files_that_are_refused(tmp_path, files, named):

@@ -90,6 +90,8 @@ test_recordings_that_are_refused = refusals(
     (table("0,0.png,0", "", header="time_s,file,x_m"), "row 0: .* x_m, y_m, heading"),
     (table("0,0,0,0", "", header=WITH_TIME), "a column 'file'"),
     (table(*([""] * 2)), "poses.csv: no frames"),
+    (table("0,0.png,0,0,0", "", header="time,file,x_m,y_m,heading_rad"), ": time: unk"),
+    (table("0,0.png,0,0,0", "", header="x_m,file,x_m,y_m,heading_rad"), "x_m: .*twice"),
     (table("0.png,0,0,1,0,0,0,0", "", header=POSE), "row 0: .* quaternion"),
     (lambda at: opened(at), "transforms.json"),
     (lambda at: opened(at / "drive.txt"), "drive.txt: not a recording"),

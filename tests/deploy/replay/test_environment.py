@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -28,6 +30,8 @@ from support.files.recordings import (
 from support.worlds.fields import homogeneous
 
 from mi_nerfattack.capture.pose_files import pose_matrix
+from mi_nerfattack.deploy.place import bundled_place
+from mi_nerfattack.deploy.registry import make_environment
 from mi_nerfattack.deploy.replay.environment import ReplayEnvironment, open_recording
 from mi_nerfattack.deploy.replay.mcap import McapTopics
 from mi_nerfattack.deploy.replay.recording import vehicle_states
@@ -35,6 +39,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.camera.rig import Rig
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -134,6 +139,23 @@ def test_toml_poses_of_the_camera_and_its_intrinsics(tmp_path):
     recording = open_recording(tmp_path / "frames", None, MOUNT)
     assert_same_camera(recording.camera)
     np.testing.assert_allclose(recording.track.camera_to_world, POSES, atol=1e-12)
+
+
+def test_poses_of_a_vehicle_are_of_its_rear_axle(tmp_path):
+    """The states are of the model's point, here 1.35 m ahead, where the mount is."""
+    place = bundled_place("intersection")
+    folder = write_csv_folder(tmp_path / "frames")
+    place = replace(place, recording=folder).with_rig(Rig.of_one(CAMERA, MOUNT))
+    car, poses = place.car, []
+    for reference in (0.0, 1.35):
+        own = replace(place, car=replace(car, reference=reference))
+        with closing(make_environment("replay", own)) as environment:
+            environment.reset(STATES[0], 0)
+            poses.append(environment.state)
+    x, y, heading = STATES[0]
+    ahead = np.array([np.cos(heading), np.sin(heading), 0.0])
+    np.testing.assert_allclose(poses[0], [x, y, heading], atol=1e-6)
+    np.testing.assert_allclose(poses[1] - poses[0], 1.35 * ahead, atol=1e-6)
 
 
 def test_a_log_of_somebody_else(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 import numpy as np
@@ -85,7 +86,26 @@ def test_depth_and_haze_of_a_known_box():
     np.testing.assert_allclose(view.depth, to_wall, atol=0.011)  # a step
     thin = homogeneous(0.3)  # 1 - exp(-0.6) = 0.45 along the axis
     view = FieldRenderer(thin).render(images.camera, images.camera_to_world[0])
-    assert view.hazy == 1
+    assert view.hazy() == 1
+    mask = np.zeros(view.opacity.shape, bool)
+    mask[:, :8] = True
+    opacity = np.where(mask, 1.0, 0.5)
+    half = dataclasses.replace(view, opacity=opacity)
+    assert (half.hazy(), half.hazy(mask)) == (0.5, 0)
+
+
+def test_masked_pixels_are_out_of_haze_and_holes():
+    """A known surface in thin fog, of which a mask takes all."""
+    images = grey_views([0])
+    renderer, pose = FieldRenderer(homogeneous(0.3)), images.camera_to_world[0]
+    expected, depth = np.zeros((12, 16, 3), np.float32), np.full((12, 16), 3.0)
+    depth[:, :8] = np.nan
+    mask = np.zeros((12, 16), bool)
+    mask[:, :8] = True
+    score = renderer.score("a", images.camera, pose, expected, depth=depth, mask=mask)
+    assert np.isnan(score.holes) and score.hazy == 1
+    score = renderer.score("a", images.camera, pose, expected, depth=depth)
+    assert score.holes == 1
 
 
 @pytest.mark.parametrize(("layers", "is_whole"), [(1, False), (2, True)])
