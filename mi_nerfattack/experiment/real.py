@@ -42,8 +42,6 @@ class Course:
         lane: of the route.
         camera: of the scenario, for recordings without intrinsics.
         mount: of the camera on the vehicle, from the point of its state.
-        on_axle: the same, from the middle of the rear axle.
-        reference: how far ahead of this axle the point is, metres.
         period: seconds between two controls.
         car: of the scenario. Drives have steering angles, where these are its control
             (rad), and otherwise heading rates.

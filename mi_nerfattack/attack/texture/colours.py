@@ -131,7 +131,7 @@ class Colours(AbstractColouring):
     @property
     def is_limited(self) -> bool:
         """Whether some colours are not allowed, or cost a penalty."""
-        return self._allowed.constraints.is_limit
+        return self._allowed.constraints.are_set
 
     def texture(self, value: np.ndarray) -> np.ndarray:
         """See :meth:`AbstractColouring.texture`."""

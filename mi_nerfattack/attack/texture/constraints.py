@@ -60,11 +60,11 @@ class Constraints:
     total_variation: NonNegative = 0.0
 
     @property
-    def is_limit(self) -> bool:
+    def are_set(self) -> bool:
         """Whether any of them is set."""
         limits = self.linf, self.l2, self.lowest, self.highest, self.gamut
-        is_set = any(limit is not None for limit in limits)
-        return is_set or bool(self.fixed) or self.total_variation > 0
+        has_limit = any(limit is not None for limit in limits)
+        return has_limit or bool(self.fixed) or self.total_variation > 0
 
     def __post_init__(self) -> None:
         lowest = max(self.lowest or 0.0, MARGIN)
