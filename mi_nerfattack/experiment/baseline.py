@@ -197,8 +197,8 @@ class Baseline:
         section, strict = world.scenario.baseline, world.scenario.attack.deterministic
         is_timed = attack.sweeps > 1 and not strict
         multiple = effort.backward_multiple if is_timed else attack.sweeps - 1.0
-        drives = attack.iteration * attack.rollout.frames / attack.rollout.horizon
-        equal = equal_count(drives, multiple)
+        # A judgement renders as many frames as an iteration
+        equal = equal_count(attack.iteration, multiple)
         count = section.textures or equal
         deployed = min(count, section.deployment_textures)
         looks = RandomAppearances.of(world, original)

@@ -80,13 +80,19 @@ def test_an_interrupted_search_goes_on(folder, tmp_path, no_results):
 def test_attacks_on_an_unattacked_path(folder, tmp_path, no_results, method):
     change = (ITERATIONS, f"method = {{ kind = {method} }}")
     work = job(folder, tmp_path / "run", change)
-    attack = build_attack(build_world(work.scenario, work.policy))
+    world = build_world(work.scenario, work.policy)
+    attack = build_attack(world)
     count = 3 if "open" in method else 48
     assert work.scenario.attack.method.iterations(2) == count
     attack.step()
     attack.step()
     assert attack.curve(1.0)[0, 0] == judged_frames(work.scenario)
     assert attack.history[1].objective < attack.history[0].objective
+    # judged as an iteration drives: as many textures as drives there and back
+    baseline = Baseline.of(
+        world, world.appearance(), attack, Effort(forward_s=2, backward_s=2)
+    )
+    assert baseline.equal == 2 * 2
 
 
 def test_searches_change_textures_alone(folder, tmp_path):

@@ -69,7 +69,7 @@ def planned_periods(scenario: Scenario) -> int:
     count = method.iterations(horizon * section.poses)
     share = method.rendered(horizon) / horizon
     back = float(method.needs_derivatives)
-    looks = scenario.baseline.textures or equal_count(count * share, back)
+    looks = scenario.baseline.textures or equal_count(count, back)
     deployed = min(looks, scenario.baseline.deployment_textures)
     drives = looks + 4 * runs
     drives += len(labelled(scenario.deployment)) * (deployed + 4 * runs)
@@ -88,7 +88,7 @@ def estimate(world: World, drive_s: Mapping[str, float]) -> Cost:
     section = scenario.attack
     count = section.method.iterations(horizon * section.poses)
     rendered = section.method.rendered(horizon)
-    equal = equal_count(count * rendered / horizon, backward / forward)
+    equal = equal_count(count, backward / forward)
     looks = scenario.baseline.textures or equal
     iteration = horizon * (forward + backward) + update
     periods = {SURROGATE: 4 * scenario.drive.runs + looks}
@@ -101,7 +101,7 @@ def estimate(world: World, drive_s: Mapping[str, float]) -> Cost:
     wall = passes * iteration + horizon * ((looks + 1) * forward + drives)
     keeps_backgrounds = isinstance(section.adjoint, KeptBackgrounds)
     again = 1 if keeps_backgrounds or not backward else 2
-    frames = section.poses * (again * passes * rendered + (looks + 1) * horizon)
+    frames = section.poses * rendered * (again * passes + looks + 1)
     frames += sum(periods.values()) * horizon
     return Cost(
         iterations=count,
