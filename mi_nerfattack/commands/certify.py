@@ -63,11 +63,11 @@ class CertifyRobustness:
     def run(self) -> Result:
         """Drive, search, bound, write and print."""
         from mi_nerfattack import variant
+        from mi_nerfattack.experiment.cases import scenario_workers
         from mi_nerfattack.experiment.certify.robustness import (
             RobustnessSettings,
             certify_robustness,
         )
-        from mi_nerfattack.experiment.servers import scenario_workers
         from mi_nerfattack.io import files
         from mi_nerfattack.report.certificate import robustness_table
         from mi_nerfattack.scenario.scenario import load_scenario

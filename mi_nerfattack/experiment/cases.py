@@ -1,4 +1,4 @@
-"""The drives of a run: what objects show in each case, in each environment."""
+"""The drives of a run: what objects show in each case and environment; who drives."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from mi_nerfattack.drives.run import (
 )
 from mi_nerfattack.drives.spec import DriveSpec, identify
 from mi_nerfattack.drives.store import Store
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.baseline import RandomAppearances
 from mi_nerfattack.io.resumable import flatten
 from mi_nerfattack.rollout.drive import NO_OBJECT, OWN, RANDOM, Drive
@@ -27,7 +28,7 @@ from mi_nerfattack.scenario.deployment import SURROGATE, labelled
 from mi_nerfattack.scenario.named_file import section_content
 from mi_nerfattack.scenario.scenario import SURROGATE_KEYS, Scenario, is_within
 from mi_nerfattack.scenario.world import Appearance, World, build_world
-from mi_nerfattack.system.workers import AbstractWorkers, tally
+from mi_nerfattack.system.workers import AbstractWorkers, chosen_workers, tally
 
 #: Called with stage, steps done, steps in all, and a remark.
 OnProgress = Callable[[str, int, int, str], None]
@@ -330,3 +331,58 @@ def shared_identity(
         section = section_content(dict(labelled(world.scenario.deployment))[label])
     shared = decisive(world.scenario, identity, in_surrogate)
     return identify(name, shared | flatten("deployment", section))
+
+
+def drives_in_carla(
+    scenarios: Sequence[Scenario], environment: str | None = None
+) -> bool:
+    """Whether a deployment is in CARLA, whose server has one client.
+
+    Args:
+        scenarios: to be driven.
+        environment: label of the only one that they drive in; None: all.
+    """
+    return any(
+        section.has_one_client and environment in (None, label)
+        for scenario in scenarios
+        for label, section in labelled(scenario.deployment)
+    )
+
+
+def need_one_process(
+    scenarios: Sequence[Scenario], count: int | None, environment: str | None = None
+) -> bool:
+    """Whether one process drives scenarios, because of a server.
+
+    Args:
+        scenarios: to be driven.
+        count: of processes, as the user chose it; None if the user did not.
+        environment: as of `drives_in_carla`.
+
+    Raises:
+        InputError: several processes for a deployment in CARLA.
+    """
+    if in_carla := drives_in_carla(scenarios, environment):
+        if count not in (None, 1):
+            raise InputError(
+                f"workers: {count} for a deployment in CARLA, whose server one process "
+                "steps; give 1"
+            )
+    behind_url = any(scenario.policy.is_remote for scenario in scenarios)
+    return in_carla or (count is None and behind_url)
+
+
+def scenario_workers(
+    scenarios: Sequence[Scenario], count: int | None, environment: str | None = None
+) -> AbstractWorkers:
+    """Return who drives scenarios; without a server, by default a process per core.
+
+    Args:
+        scenarios: to be driven.
+        count: as of `need_one_process`.
+        environment: as of `drives_in_carla`.
+
+    Raises:
+        InputError: see `need_one_process`.
+    """
+    return chosen_workers(count, need_one_process(scenarios, count, environment))

@@ -19,12 +19,16 @@ from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.drives.spec import DriveSpec
 from mi_nerfattack.errors import InputError, RefusedError, is_of_disk
 from mi_nerfattack.experiment.baseline import Baseline, Judge, Judgements
-from mi_nerfattack.experiment.cases import Cases, OnProgress, step_counter
+from mi_nerfattack.experiment.cases import (
+    Cases,
+    OnProgress,
+    scenario_workers,
+    step_counter,
+)
 from mi_nerfattack.experiment.checks import before_attack
 from mi_nerfattack.experiment.claim import LOOKS, claimed
 from mi_nerfattack.experiment.finished import Finished, Frames, Run
 from mi_nerfattack.experiment.run_folder import Account, Effort, RunFolder
-from mi_nerfattack.experiment.servers import scenario_workers
 from mi_nerfattack.extras import require
 from mi_nerfattack.rollout.drive import (
     ATTACK,

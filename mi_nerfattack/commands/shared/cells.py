@@ -24,7 +24,7 @@ def chosen_count(cells: Sequence[Cell], workers: int | None) -> int | None:
     Raises:
         InputError: several in CARLA.
     """
-    from mi_nerfattack.experiment.servers import need_one_process
+    from mi_nerfattack.experiment.cases import need_one_process
 
     return 1 if need_one_process(_scenarios(cells), workers) else workers
 
@@ -49,7 +49,7 @@ def cell_workers(
     Raises:
         InputError: see `chosen_count`, or the number is out of range.
     """
-    from mi_nerfattack.experiment.servers import drives_in_carla
+    from mi_nerfattack.experiment.cases import drives_in_carla
     from mi_nerfattack.system.workers import InThisProcess, Processes
 
     count = cells_at_a_time(cells, workers, cores)

@@ -13,8 +13,8 @@ import pandas as pd
 
 from mi_nerfattack import variant
 from mi_nerfattack.errors import InputError, RefusedError
+from mi_nerfattack.experiment.cases import need_one_process
 from mi_nerfattack.experiment.job import quiet
-from mi_nerfattack.experiment.servers import need_one_process
 from mi_nerfattack.experiment.sweep.cell import (
     CELLS,
     PROVENANCE,
