@@ -53,7 +53,7 @@ class BenchReach:
     in which the objects change pixels by 0.1 or more, the pixels and the reach of
     these frames (median and most, in the unit of the control), and the largest error
     of three drives from the nominal start: as the objects look, and with all frames'
-    controls raised or lowered. A place takes a minute.
+    controls raised or lowered. A place takes a minute, with six objects some minutes.
 
     A table in a file continues: a place is not measured again if the file has a row of
     it with the same scenario, as its digest in the file says. Otherwise the new row

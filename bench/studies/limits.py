@@ -46,8 +46,8 @@ def limits(places: pd.DataFrame) -> Finding:
         f"lane at {rows['out'].sum():.0f} of {len(rows)} places",
         sentences=(
             "The reach is the largest change of the control that the pixels of the "
-            "objects can cause, in rad/s. If each pixel takes its worst value in each "
-            f"frame, the car leaves the lane at {', and at '.join(counts)}.",
+            "objects can cause, in rad/s. Each pixel takes its worst value in each "
+            f"frame. Then the car leaves the lane at {', '.join(counts)}.",
             f"The reach is smallest for {weakest}: {medians[weakest]:.2f} rad/s in the "
             "median.",
             "Over all places, the largest error with the original colours has a median "
