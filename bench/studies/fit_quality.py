@@ -58,12 +58,13 @@ def fit_quality(
         [
             *(f"`{name}`", f"{psnr[name]:.1f}"),
             *(f"{errors.loc[name].mean():.3f}" for errors in (bare, inside, deployed)),
-            f"{_mean(transfer.loc[name])[0]:.2f}",
+            f"{_mean(transfer.loc[name])[0]:#.2g}",
             *_cells(ratios.get(name)),
         ]
         for name in names
     ]
-    shares = ", ".join(f"{_mean(transfer.loc[n])[0]:.2f} (`{n}`)" for n in names)
+    shares = ", ".join(f"{_mean(transfer.loc[n])[0]:#.2g} (`{n}`)" for n in names)
+    has_intervals = any(ends is not None for _, ends in ratios.values())
     listed = ", ".join(f"`{name}`" for name in poor) or "none of them"
     return Finding(
         title=_title(len(poor), len(ratios), ratios[worst][0], psnr=psnr[worst]),
@@ -72,15 +73,16 @@ def fit_quality(
             f"{ratios[worst][0]:.2f} times the error of attacks from `{BEST}` "
             f"({deployed.shape[1]} places, geometric mean, "
             f"{interval_words(ratios[worst][1], 2)}).",
-            f"The error there, divided by the error in the field, is {shares}.",
-            "A field is too poor if the interval of its ratio lies below 1. This holds "
-            f"for {listed}.",
+            "The error there, divided by the error in the field, is "
+            f"(geometric mean) {shares}.",
+            "A field is too poor if the interval of its ratio lies below 1. "
+            + (f"This holds for {listed}." if has_intervals else "None has one yet."),
         ),
         head=[
             *("field", "PSNR along the routes (dB)", "no object, in the field (m)"),
             *("attack, in the field (m)", f"attack, `{where}` (m)"),
-            f"`{where}` to field (geometric mean)",
-            *(f"`{where}`, ratio to `{BEST}` (geometric mean)", "95 % interval"),
+            f"`{where}` to field",
+            *(f"`{where}`, ratio to `{BEST}`", "95 % interval"),
         ],
         rows=rows,
         draw=lambda figure: draw_ratios(

@@ -257,6 +257,8 @@ def test_a_field_is_too_poor_if_the_interval_of_its_ratio_lies_below_one():
     assert answer.rows[0][:3] == ["`steps_300`", "20.0", "0.100"]
     assert answer.rows[0][5:7] == ["0.50", "0.50"]
     assert answer.rows[2][-2:] == ["1", "–"]
+    few = fit_quality(rows[rows["seed"].isin(rows["seed"].unique()[:2])], psnr)
+    assert few.sentences[2].endswith("lies below 1. None has one yet.")
     better = psnr | {"steps_300": 29.0}
     assert "1.00 times" in fit_quality(rows, better).title
     level = rows[rows["method"] != "steps_300"]
