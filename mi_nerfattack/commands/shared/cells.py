@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from mi_nerfattack.experiment.sweep.cell import Cell
     from mi_nerfattack.experiment.sweep.summary import Taken
     from mi_nerfattack.experiment.sweep.sweep import Sweep
-    from mi_nerfattack.scenario.scenario import Scenario
     from mi_nerfattack.system.workers import AbstractWorkers
 
 
@@ -25,8 +24,9 @@ def chosen_count(cells: Sequence[Cell], workers: int | None) -> int | None:
         InputError: several in CARLA.
     """
     from mi_nerfattack.experiment.cases import need_one_process
+    from mi_nerfattack.experiment.sweep.cell import scenarios_of
 
-    return 1 if need_one_process(_scenarios(cells), workers) else workers
+    return 1 if need_one_process(scenarios_of(cells), workers) else workers
 
 
 def cells_at_a_time(cells: Sequence[Cell], workers: int | None, cores: int = 1) -> int:
@@ -50,17 +50,13 @@ def cell_workers(
         InputError: see `chosen_count`, or the number is out of range.
     """
     from mi_nerfattack.experiment.cases import drives_in_carla
+    from mi_nerfattack.experiment.sweep.cell import scenarios_of
     from mi_nerfattack.system.workers import InThisProcess, Processes
 
     count = cells_at_a_time(cells, workers, cores)
-    if drives_in_carla(_scenarios(cells)):
+    if drives_in_carla(scenarios_of(cells)):
         return InThisProcess()  # it gives the server back, however the work ends
     return Processes(count, pieces_each=1)
-
-
-def _scenarios(cells: Sequence[Cell]) -> list[Scenario]:
-    """Return a scenario of each kind of cell; seeds decide nothing here."""
-    return [cell.scenario for cell in {cell.kind: cell for cell in cells}.values()]
 
 
 def do_cells(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -80,6 +80,15 @@ class Cell:
             InputError: what it names is not usable here.
         """
         return _scenario(self.id, self.text)
+
+
+def scenarios_of(cells: Sequence[Cell]) -> list[Scenario]:
+    """Return a scenario of each kind of cell; others differ in their seed alone.
+
+    Raises:
+        InputError: see `Cell.scenario`.
+    """
+    return [cell.scenario for cell in {cell.kind: cell for cell in cells}.values()]
 
 
 def absolute_text(name: str, text: str, folder: Path) -> str:

@@ -22,6 +22,7 @@ from mi_nerfattack.experiment.sweep.cell import (
     folder_of,
     is_complete,
     run_cell,
+    scenarios_of,
 )
 from mi_nerfattack.experiment.sweep.grid import load_cells
 from mi_nerfattack.experiment.sweep.summary import SUMMARY, Taken, write_summary
@@ -245,7 +246,7 @@ def sweep(
         progress("cells", len(state.complete), len(cells), remark)
 
     work = Cells(cells, files.make_folder(Path(folder)).resolve())
-    need_one_process([cell.scenario for cell in cells], workers)  # refuses others
+    need_one_process(scenarios_of(cells), workers)  # refuses others
     crew = Processes(workers, pieces_each=1) if workers > 1 else InThisProcess()
     Sweep(work, show).run(crew)
     write_summary(work.folder)
