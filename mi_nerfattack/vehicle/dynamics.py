@@ -15,6 +15,7 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar
 
 import drjit as dr
@@ -24,6 +25,9 @@ import numpy as np
 from mi_nerfattack.backend.arrays import rows_type, upload_rows
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Acute, Positive, checked
+
+#: Step of the controls, and slope above which a speed follows one, in SI units.
+_CONTROL_STEP, _SPEED_SLOPE = 1e-4, 1e-6
 
 
 def state_type(size: int = 3) -> Any:
@@ -229,12 +233,43 @@ class AbstractDynamics(ABC):
         """Return speeds (n,) along the headings of states (m, n), m/s; signed.
 
         Differentiable; with the control 0, which moves no vehicle at once.
+
+        Raises:
+            InputError: the speed follows a control at once, so a state has none.
         """
-        none, size = dr.zeros(type(state[0]), dr.width(state)), self.control_size
-        control = none if size == 1 else rows_type(type(none))(*[none] * size)
+        if not self.has_speed:
+            raise InputError(
+                f"{type(self).__name__}: its speed is a control and not in its state, "
+                "and the policy is told the speed (policy.inputs); let the speed be a "
+                "row of the state, override speed_of, or leave it out of the inputs"
+            )
+        none = dr.zeros(type(state[0]), dr.width(state))
+        return self._speed_with(state, [none] * self.control_size)
+
+    def _speed_with(self, state: Any, rows: Sequence[Any]) -> Any:
+        """Compute speeds (n,) of states (m, n) under controls of k rows (n,)."""
+        control = rows[0] if len(rows) == 1 else rows_type(type(rows[0]))(*rows)
         slope = self.derivative(state, control)
         sin, cos = dr.sincos(state[2])
         return slope[0] * cos + slope[1] * sin
+
+    @cached_property
+    def has_speed(self) -> bool:
+        """Whether states say the speed: no control changes the speed at once.
+
+        Slip by steering does so in second order, which does not count.
+        """
+        state = to_state(self.extend(np.zeros((1, 3))))
+        row = dr.value_t(type(state))
+        steps = _CONTROL_STEP * np.eye(self.control_size)
+        ends = [
+            self._speed_with(state, [row(value) for value in sign * step])
+            for step in steps
+            for sign in (1, -1)
+        ]
+        values = np.array([end.numpy() for end in ends]).reshape(-1, 2)
+        slopes = (values[:, 0] - values[:, 1]) / (2 * _CONTROL_STEP)
+        return bool((np.abs(slopes) <= _SPEED_SLOPE).all())
 
     def numbered(self, first: int) -> AbstractDynamics:
         """Return this model with another number of the first drive of each batch.

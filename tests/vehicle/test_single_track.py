@@ -11,6 +11,7 @@ import pytest
 from support.faults.refusals import refusals
 from support.reference.derivatives import row64, state64
 
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.vehicle import (
     RK4,
     AbstractDynamics,
@@ -25,6 +26,7 @@ from mi_nerfattack.vehicle import (
 from mi_nerfattack.vehicle.dynamics import require_controls
 from mi_nerfattack.vehicle.integrators import Transition
 from mi_nerfattack.vehicle.single_track import GRAVITY, longitudinal
+from mi_nerfattack.vehicle.user_model import FunctionDynamics
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -190,6 +192,21 @@ def test_speeds():
     np.testing.assert_allclose(speed.numpy(), [6, 7], rtol=1e-12)
     dr.backward(dr.sum(speed))
     np.testing.assert_allclose(dr.grad(x).numpy()[3], [1, 1], rtol=1e-12)
+
+
+def test_speed_as_control():
+    """Nothing reads a speed of 0 from a state that has none."""
+
+    def kinematic(state, control):
+        steering, speed = control
+        _, _, theta = state
+        return speed * dr.cos(theta), speed * dr.sin(theta), steering
+
+    model = FunctionDynamics(kinematic, controls=2)
+    assert not model.has_speed
+    with pytest.raises(InputError, match="speed is a control and not in its state"):
+        model.speed_of(state64([[0.0], [0.0], [0.3]]))
+    assert ROLLING.has_speed and SLIPPING.has_speed and Dubins(5.0).has_speed
 
 
 def test_vehicles_start_at_their_speed():

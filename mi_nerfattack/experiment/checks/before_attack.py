@@ -203,6 +203,8 @@ def speed_findings(world: World) -> Iterator[str]:
     """Tell of a vehicle that is faster or slower than the routes file says."""
     scenario, dynamics = world.scenario, world.motion.dynamics
     scene, drive, period = scenario.scene, scenario.drive, scenario.vehicle.dt_s
+    if not dynamics.has_speed:
+        return
     route = Route.from_file(scene.routes.file, scene.route)
     state = to_state(dynamics.extend(world.initial[:1]))
     speed = float(dynamics.speed_of(state)[0])
