@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axis import Axis, XAxis
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from mi_nerfattack.evaluation.summary import Interval
@@ -15,6 +17,7 @@ from mi_nerfattack.report.plots.charts import BLUE, GREY, PALETTE
 
 DISTANCE = "mean distance from the lane centre (m)"
 _MARKS = "_^Dosv"
+_ABOVE: Any = {"loc": "outside upper center", "ncols": 6, "frameon": False}
 
 
 def draw_places(figure: Figure, errors: pd.DataFrame) -> None:
@@ -27,7 +30,7 @@ def draw_places(figure: Figure, errors: pd.DataFrame) -> None:
     axis.set_xticks(range(len(errors)), list(errors.index), rotation=45, ha="right")
     _make_logarithmic(axis.yaxis)
     axis.set_ylabel(DISTANCE)
-    figure.legend(loc="outside upper center", ncols=6, frameon=False)
+    figure.legend(**_ABOVE)
 
 
 def draw_searches(figure: Figure, errors: pd.DataFrame) -> None:
@@ -38,7 +41,7 @@ def draw_searches(figure: Figure, errors: pd.DataFrame) -> None:
     _make_logarithmic(axis.xaxis)
     axis.set_xlabel(DISTANCE)
     _name_rows(figure, list(errors.index))
-    figure.legend(loc="outside upper center", ncols=6, frameon=False)
+    figure.legend(**_ABOVE)
 
 
 def draw_ratios(
@@ -66,6 +69,33 @@ def draw_shares(figure: Figure, shares: Mapping[str, float], label: str) -> None
     axis.set_xlim(0, 1.1)
     axis.set_xlabel(label)
     _name_rows(figure, list(shares))
+
+
+def draw_reach(figure: Figure, places: pd.DataFrame) -> None:
+    """Draw the reach of each place, rad/s, logarithmic; full where the car goes out.
+
+    Args:
+        figure: empty.
+        places: with the columns `kind`, `route`, `moved` and `out`.
+    """
+    axis, names = figure.subplots(), []
+    for (kind, route), own in places.groupby(
+        ["kind", "route"], observed=True, sort=False
+    ):
+        for is_out, marks in own.groupby("out"):
+            (line,) = axis.plot(marks["moved"], [len(names)] * len(marks), "o")
+            line.set(color=BLUE, fillstyle="full" if is_out else "none")
+        name = str(kind).replace("_", " ")
+        names.append(f"{name}, {route}: {own['out'].sum()} of {len(own)}")
+    full, empty = (
+        Line2D([], [], marker="o", linestyle="", color=BLUE, fillstyle=style)
+        for style in ("full", "none")
+    )
+    labels = ["the car leaves its lane", "it stays in its lane"]
+    _make_logarithmic(axis.xaxis)
+    axis.set_xlabel("reach (rad/s), one mark per place")
+    _name_rows(figure, names)
+    figure.legend([full, empty], labels, **_ABOVE)
 
 
 def draw_heat(figure: Figure, ratios: pd.DataFrame) -> None:

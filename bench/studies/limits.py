@@ -1,67 +1,99 @@
-"""The finding about the reach of objects: where they can take the car off the lane."""
+"""The finding about the reach of objects: where they take the car out of its lane."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import pandas as pd
 
-from bench.studies.charts import draw_shares
+from bench.studies.charts import draw_reach
 from bench.studies.content import Finding
+from mi_nerfattack.evaluation.summary import share_interval
 
-#: By the name in the tables of places.
-_OBJECTS: dict[Any, str] = {
-    "patch": "a patch",
+#: In the order of the page, by their names in the table of places.
+_OBJECTS = {
     "billboard": "a billboard",
+    "patch": "a patch",
     "3_cars_3_hydrants": "three cars and three hydrants",
 }
+_MEDIANS = ["in_view", "pixels", "moved", "original_m", "farthest_m"]
 
 
 def limits(places: pd.DataFrame) -> Finding:
-    """Count the places where objects could take the car off the lane.
+    """Count the places where objects could take the car out of its lane.
 
     Args:
         places: table of ``python -m bench reach``.
     """
-    names = places["place"].str.extract(r"^(?P<route>\w+?)-(?P<objects>.+)-\d+$")
+    names = places["place"].str.extract(r"^(?P<route>\w+?)-(?P<kind>.+)-\d+$")
     rows = places.join(names)
-    rows["farthest"] = rows[["up_m", "down_m"]].max(axis=1)
-    rows["out"] = (rows["farthest"] > rows["limit_m"]).astype(float)
-    columns = ["out", "pixels", "moved", "original_m", "farthest"]
-    lines, shares, medians = [], {}, {}
-    for (kind, route), own in rows.groupby(["objects", "route"], sort=False):
-        out, *middle = [own["out"].sum(), *own[columns[1:]].median()]
-        medians[f"{_OBJECTS[kind]} on the route `{route}`"] = middle[1]
-        shares[f"{kind}, {route}"] = float(out / len(own))
-        counts = f"{out:.0f}/{len(own)}"
-        figures = [f"{middle[0]:.0f}", *(f"{value:.2f}" for value in middle[1:])]
-        lines.append([_OBJECTS[kind], str(route), counts, *figures])
-    weakest = min(medians, key=lambda name: medians[name])
-    counts = [
-        f"{own['out'].sum():.0f} of {len(own)} places with {_OBJECTS[kind]}"
-        for kind, own in rows.groupby("objects", sort=False)
-    ]
+    rows["kind"] = pd.Categorical(rows["kind"], list(_OBJECTS), ordered=True)
+    rows = rows.sort_values("kind", kind="stable")
+    rows["farthest_m"] = rows[["up_m", "down_m"]].max(axis=1)
+    rows["out"] = rows["farthest_m"] > rows["limit_m"]
+    by_kind = rows.groupby("kind", observed=True)
+    weakest = by_kind["out"].mean().idxmin()
+    moved = rows.groupby(["kind", "route"], observed=True, sort=False)["moved"].median()
+    least, most = moved[weakest].min(), moved[weakest].max()
+    original = rows["original_m"] > rows["limit_m"]
     return Finding(
-        title="With a picture of its own in each frame, objects take the car off the "
-        f"lane at {rows['out'].sum():.0f} of {len(rows)} places",
+        title=f"If it changed in each frame, {_OBJECTS[weakest]} would take the car "
+        f"out of its lane at {_count(by_kind.get_group(weakest)['out'])} places",
         sentences=(
-            "The reach is the largest change of the control that the pixels of the "
-            "objects can cause, in rad/s. Each pixel takes its worst value in each "
-            f"frame. Then the car leaves the lane at {', '.join(counts)}.",
-            f"The reach is smallest for {weakest}: {medians[weakest]:.2f} rad/s in the "
-            "median.",
-            "Over all places, the largest error with the original colours has a median "
-            f"of {rows['original_m'].median():.2f} m.",
+            "In each frame, a local search gives each pixel of the objects the value "
+            "that changes the steering most. The *reach* is this change, in rad/s. Two "
+            "drives per place show these frames to the policy: one always steers more "
+            "to the left, the other one more to the right.",
+            "At least one of the two drives leaves the lane at "
+            + ", ".join(
+                f"{_count(own['out'])} places with {_OBJECTS[kind]}{_ends(own['out'])}"
+                for kind, own in by_kind
+            )
+            + f". With the original colours, the car does so at {_count(original)} places.",
+            f"The reach of {_OBJECTS[weakest]} has medians of {least:.2f} to "
+            f"{most:.2f} rad/s on the routes, the reach of other objects "
+            f"{moved.drop(weakest).min():.2f} to {moved.drop(weakest).max():.2f} "
+            "rad/s. The largest control of the car is 1.5 rad/s. " + _threshold(rows),
         ),
         head=[
-            *("objects", "route", "places off the lane", "pixels, median"),
+            *("objects", "route", "places out of the lane"),
+            *("frames in view, median", "pixels in such a frame, median"),
             "reach, median (rad/s)",
-            *("largest error, original, median (m)", "with the reach, median (m)"),
+            "largest distance from the lane centre, original, median (m)",
+            "the same with the reach, the larger of two drives, median (m)",
         ],
-        rows=lines,
-        draw=lambda figure: draw_shares(
-            figure, shares, "share of places where the reach takes the car off the lane"
-        ),
-        pandas='drives["route"] = drives.place.str.split("-").str[0]\n'
-        'print(drives.groupby("route")[["moved", "up_m", "down_m"]].median())',
+        rows=[
+            [_OBJECTS[kind], f"`{route}`", _count(own["out"])]
+            + [f"{value:.0f}" for value in own[_MEDIANS[:2]].median()]
+            + [f"{value:.2f}" for value in own[_MEDIANS[2:]].median()]
+            for (kind, route), own in rows.groupby(
+                ["kind", "route"], observed=True, sort=False
+            )
+        ],
+        draw=lambda figure: draw_reach(figure, rows),
+        pandas='drives["kind"] = drives.place.str.split("-").str[1]\n'
+        'print(drives.groupby("kind")[["moved", "up_m", "down_m"]].median())',
+    )
+
+
+def _count(out: pd.Series) -> str:
+    """Say at how many places something holds."""
+    return f"{out.sum()} of {len(out)}"
+
+
+def _threshold(rows: pd.DataFrame) -> str:
+    """Say from which reach on the car leaves its lane everywhere."""
+    staying, leaving = rows[~rows["out"]]["moved"], rows[rows["out"]]["moved"]
+    if staying.empty or leaving.empty:
+        return ""
+    return (
+        "The car stays in its lane at no place where the reach is over "
+        f"{staying.max():.3f} rad/s. It leaves its lane at no place where the reach is "
+        f"under {leaving.min():.3f} rad/s."
+    )
+
+
+def _ends(out: pd.Series) -> str:
+    """Say in which interval the share of such places lies."""
+    ends = share_interval(int(out.sum()), len(out))
+    return (
+        f" (95 % interval {100 * ends[0]:.0f} to {100 * ends[1]:.0f} %)" if ends else ""
     )

@@ -316,16 +316,28 @@ def test_limits_counts_places_beyond_the_lane():
     rows = [
         {"place": f"{route}-{kind}-{seed}", "pixels": 10, "moved": 0.1 * number}
         | {"original_m": 0.1, "up_m": up, "down_m": 0.2, "limit_m": 0.85}
+        | {"in_view": 20}
         for number, (route, kind, up) in enumerate(
             [("left", "patch", 0.9), ("left", "billboard", 0.8)], 1
         )
         for seed in (1, 2)
     ]
     answer = made("limits", pd.DataFrame(rows))
-    assert answer.title.endswith("at 2 of 4 places")
-    assert [row[2] for row in answer.rows] == ["2/2", "0/2"]
-    assert "a patch on the route `left`" in answer.sentences[1]
-    assert "0.10 rad/s" in answer.sentences[1]
+    assert answer.title.endswith(
+        "a billboard would take the car out of its lane at 0 of 2 places"
+    )
+    assert [row[:3] for row in answer.rows] == [
+        ["a billboard", "`left`", "0 of 2"],
+        ["a patch", "`left`", "2 of 2"],
+    ]
+    assert "2 of 2 places with a patch" in answer.sentences[1]
+    assert "medians of 0.20 to 0.20 rad/s" in answer.sentences[2]
+    assert "where the reach is over 0.200 rad/s" in answer.sentences[2]
+
+    answer.draw(figure := Figure())
+    billboards, patches = figure.axes[0].lines
+    assert list(billboards.get_xdata()) == [0.2] * 2
+    assert (billboards.get_fillstyle(), patches.get_fillstyle()) == ("none", "full")
 
 
 def test_charts_draw_ratios_intervals_and_heat():
