@@ -67,7 +67,42 @@ def test_the_readme_says_what_the_rows_of_the_country_road_say():
     assert made is not None
     assert "at 16 of 16 places, but never out of its lane" in made.title
     readme = " ".join((ROOT / "README.md").read_text("utf-8").split())
-    assert "At all 16 places on [a country road]" in readme
+    assert "too, at 16 of 16 places, but never out of its lane" in readme
+
+
+def test_the_results_of_the_readme_equal_their_rows():
+    readme = " ".join((ROOT / "README.md").read_text("utf-8").split())
+    rows = read_table(ROOT / "docs/results/table2/results.csv")
+    rows = rows[rows["environment"] == "mitsuba"]
+    attack = rows[rows["case"] == "attack"]
+    assert set(attack[attack["departed"]]["route"]) == {"left"}
+    words = "With the attack, {} of {} drives left the lane, all on the left turn."
+    assert words.format(attack["departed"].sum(), len(attack)) in readme
+    departed = rows[rows["case"].isin(["random", "best_random"])]["departed"]
+    assert f"random textures, {departed.sum()} of {len(departed)} did" in readme
+    places = rows.groupby(["case", "route", "seed"])["cross_track_mean_m"].mean()
+    medians = (f"{places[case].median():.2f} m" for case in ("attack", "best_random"))
+    assert f"worst random texture: {' against '.join(medians)}" in readme
+
+    page = (ROOT / "docs/results/findings/transfer.md").read_text("utf-8")
+    assert "0.21 to 0.35 for built-in objects" in " ".join(page.split())
+    assert "[0.21 to 0.35 of the error](docs/results/findings/transfer.md)" in readme
+    drives = pd.read_csv(ROOT / "docs/results/matrix/drives.csv")
+    lit = drives[drives["environment"].str.endswith("_built_in")]
+    lit = lit[(lit["case"] == "attack") & (lit["condition"] == "day")]
+    counts = lit.groupby("environment")["departed"].agg(["sum", "size"])
+    assert set(counts["size"]) == {24} and counts["sum"].max() == 1
+    assert "at most 1 of 24 drives leaves the lane" in readme
+
+    rows = pd.read_csv(ROOT / "bench/retrain/better-retrain.csv")
+    rows = rows[(rows["environment"] == "mitsuba") & (rows["case"] == "attack")]
+    out = rows.groupby(["group", "policy"])["departed"].agg(["sum", "size"])
+    assert out.loc["old", "after"]["sum"] == out.loc["held_out", "after"]["sum"] == 0
+    new, old = out.loc["adaptive", "after"], out.loc["old", "before"]
+    words = (
+        f"took {new['sum']} of {new['size']} drives out of the lane. The old policy "
+    )
+    assert f"{words}with the old attacks had {old['sum']} such drives" in readme
 
 
 def test_the_table_of_the_demo_equals_its_rows():
@@ -76,7 +111,10 @@ def test_the_table_of_the_demo_equals_its_rows():
         "its original colours": ("surrogate", "own"),
         "random textures": ("surrogate", "random"),
         "the attack": ("surrogate", "attack"),
-        "the attack, in a path-traced scene that it never saw": ("mitsuba", "attack"),
+        "the attack, pasted into path-traced images that the search never saw": (
+            "mitsuba",
+            "attack",
+        ),
     }
     text = (ROOT / "README.md").read_text("utf-8")
     for words, (environment, case) in shown.items():
