@@ -94,7 +94,13 @@ def places_chart(table: pd.DataFrame) -> Figure:
             style = {"s": 34, "color": colour, "marker": marker, "alpha": 0.75}
             axis.scatter(x, y, label=label, **style)
         axis.axhline(LIMIT_M, color=GREY, linestyle="--", linewidth=1)
-        axis.text(-0.4, LIMIT_M * 1.15, "a wheel is off the lane", color=GREY, size=9.5)
+        axis.text(
+            -0.4,
+            LIMIT_M * 1.15,
+            "here a wheel is out of the lane",
+            color=GREY,
+            size=9.5,
+        )
         for k in range(1, len(places)):
             if places[k][0] != places[k - 1][0]:
                 axis.axvline(k - 0.5, color="#cccccc", linewidth=1)
