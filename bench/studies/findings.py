@@ -9,7 +9,7 @@ nothing.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -41,7 +41,7 @@ from mi_nerfattack.evaluation.summary import (
     summary,
 )
 from mi_nerfattack.experiment.sweep.summary import GRADIENT
-from mi_nerfattack.rollout.drive import ATTACK, RANDOM
+from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, RANDOM
 from mi_nerfattack.scenario.deployment import SURROGATE
 
 _BY_GRADIENT = ("attached", "open_loop", "single_frame")
@@ -88,12 +88,17 @@ def gradient(drives: pd.DataFrame) -> Finding:
         f"The gradient moves the car farther than {better} of {len(without)} searches "
         "without a gradient at equal cost"
     )
-    close, nearest = min(fair.items(), key=lambda item: item[1].ratio or 0.0)
+    close, nearest = min(
+        ((name, fair[name]) for name in without or fair),
+        key=lambda item: item[1].ratio or 0.0,
+    )
     wins = [farther[name][0] for name in fair]
+    there = _deployed(drives)
     head = [GRADIENT, f"{frames[GRADIENT]:.0f}", f"{nearest.one:.3f}"]
-    rows = [head + 5 * ["–"]] + [
+    rows = [[*head, _metres_cell(there, GRADIENT), *(5 * ["–"])]] + [
         [
             *(name, f"{frames[name]:.0f}", f"{effect.other:.3f}"),
+            _metres_cell(there, name),
             *(f"{effect.ratio:.2f}", ends_cell(effect.ratio_ci95, 2)),
             f"{farther[name][0]}/{effect.attacks}",
             *(metres(effect.difference), metres(effect.spread)),
@@ -107,15 +112,16 @@ def gradient(drives: pd.DataFrame) -> Finding:
             f"{nearest.one:.2f} m from the lane centre on average in the surrogate, "
             f"and is farther than {also} of {len(others)} other searches by gradient "
             f"at equal cost ({', '.join(f'`{name}`' for name in others)}).",
-            f"The closest other search is `{close}`: the gradient moves the car "
-            f"{nearest.ratio:.2f} times as far "
+            f"Of the searches without a gradient, `{close}` is the closest: the "
+            f"gradient moves the car {nearest.ratio:.2f} times as far "
             f"({interval_words(nearest.ratio_ci95, 2)}).",
             f"Compared with each of the {len(fair)} searches at equal cost, the "
             "gradient is farther at "
             f"{min(wins)} to {max(wins)} of {nearest.attacks} places.",
         ),
         head=[
-            *("search", "frames", "mean error (m)", "gradient to search"),
+            *("search", "frames", "mean error (m)", "in `mitsuba` (m)"),
+            "gradient to search",
             *("95 % interval", "gradient farther", "difference", "its spread"),
         ],
         rows=rows,
@@ -218,15 +224,19 @@ def flat(drives: pd.DataFrame) -> Finding:
     percent = f"{100 * shares[CASES[ATTACK]]:.0f} %"
     title = f"Flat objects send the car out of its lane in {percent} of the drives"
     kinds = summary(own, ["objects", "case"], ["cell"])
+    sides = own[own["case"] == ATTACK], own[own["case"] == BEST_RANDOM]
+    (farther, _), effect = is_farther(*sides), compare(*sides, ERROR)
     return Finding(
         title=title,
         sentences=(
             f"With the attack, {left[ATTACK]} of {count[ATTACK]} drives leave the lane "
             "in the path-traced scene, where its sun and sky light the object. "
             f"The drives that leave it are at {out} of {all_places} places (share: "
-            f"{interval_words(ends, 2)}).",
+            f"{interval_words(ends, 2)}). {_by_environment(drives)}",
             f"With random textures, {left[RANDOM]} of {count[RANDOM]} drives leave the "
-            "lane.",
+            "lane. The attack moves the car farther than the worst random texture at "
+            f"{farther} of {all_places} places (ratio of the means {effect.ratio:.2f}, "
+            f"{interval_words(effect.ratio_ci95, 2)}).",
             "The aim that we set before the first result is 60 % of the drives with "
             "the attack, and none with random textures."
             + (lost if most < FLAT_AIM else ""),
@@ -250,7 +260,7 @@ def flat(drives: pd.DataFrame) -> Finding:
         ),
         pandas='lit = drives[drives.environment == "built_in"]\n'
         'print(lit.groupby(["objects", "case"]).departed.mean())',
-        threats=(_by_environment(drives), _routes(own)),
+        threats=(_routes(own),),
     )
 
 
@@ -263,8 +273,8 @@ def _by_environment(drives: pd.DataFrame) -> str:
         for name, count, n in left.itertuples()
     )
     return (
-        "Drives with the attack that leave the lane, and the mean error, by "
-        f"environment: {counts}."
+        "By environment, these drives with the attack leave the lane (with the mean "
+        f"error): {counts}."
     )
 
 
@@ -275,7 +285,10 @@ def _routes(own: pd.DataFrame) -> str:
     counts = ", ".join(
         f"{kind} on `{route}` {count}" for (kind, route), count in places.items()
     )
-    return f"The places so far: {counts}. Other routes may give other shares."
+    return (
+        f"The places so far: {counts}. The missing places are not random, because "
+        "routes are missing. Another route may give another share."
+    )
 
 
 #: By the name of the page: what is not known while attacks are missing, and the rest.
@@ -297,6 +310,16 @@ FINDINGS: dict[str, tuple[str, Callable[[pd.DataFrame], Finding]]] = {
 def _attacks(drives: pd.DataFrame) -> pd.DataFrame:
     """Return the drives with the attack in the surrogate."""
     return drives[(drives["environment"] == SURROGATE) & (drives["case"] == ATTACK)]
+
+
+def _deployed(drives: pd.DataFrame) -> dict[str, float]:
+    """Return the mean errors with the attack where no search drove, by search."""
+    own = drives[(drives["environment"] != SURROGATE) & (drives["case"] == ATTACK)]
+    return {str(name): x for name, x in own.groupby("method")[ERROR].mean().items()}
+
+
+def _metres_cell(errors: Mapping[str, float], name: str) -> str:
+    return f"{errors[name]:.3f}" if name in errors else "–"
 
 
 def _is_equal(frames: pd.Series, name: str) -> bool:

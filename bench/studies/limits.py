@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pandas as pd
 
 from bench.studies.charts import draw_reach
@@ -9,7 +11,7 @@ from bench.studies.content import Finding
 from mi_nerfattack.evaluation.summary import share_interval
 
 #: In the order of the page, by their names in the table of places.
-_OBJECTS = {
+_OBJECTS: dict[Any, str] = {
     "billboard": "a billboard",
     "patch": "a patch",
     "3_cars_3_hydrants": "three cars and three hydrants",
@@ -30,8 +32,8 @@ def limits(places: pd.DataFrame) -> Finding:
     rows["farthest_m"] = rows[["up_m", "down_m"]].max(axis=1)
     rows["out"] = rows["farthest_m"] > rows["limit_m"]
     by_kind = rows.groupby("kind", observed=True)
-    weakest = by_kind["out"].mean().idxmin()
-    moved = rows.groupby(["kind", "route"], observed=True, sort=False)["moved"].median()
+    by_route = rows.groupby(["kind", "route"], observed=True, sort=False)
+    weakest, moved = by_kind["out"].mean().idxmin(), _medians(by_route)
     least, most = moved[weakest].min(), moved[weakest].max()
     original = rows["original_m"] > rows["limit_m"]
     return Finding(
@@ -42,12 +44,14 @@ def limits(places: pd.DataFrame) -> Finding:
             "that changes the steering most. The *reach* is this change, in rad/s. Two "
             "drives per place show these frames to the policy: one always steers more "
             "to the left, the other one more to the right.",
-            "At least one of the two drives leaves the lane at "
-            + ", ".join(
-                f"{_count(own['out'])} places with {_OBJECTS[kind]}{_ends(own['out'])}"
+            "A place counts if at least one of the two drives leaves the lane. "
+            + " ".join(
+                f"With {_OBJECTS[kind]}, {_count(own['out'])} places count"
+                f"{_ends(own['out'])}."
                 for kind, own in by_kind
             )
-            + f". With the original colours, the car does so at {_count(original)} places.",
+            + " With the original colours, the car leaves the lane at "
+            f"{_count(original)} places.",
             f"The reach of {_OBJECTS[weakest]} has medians of {least:.2f} to "
             f"{most:.2f} rad/s on the routes, the reach of other objects "
             f"{moved.drop(weakest).min():.2f} to {moved.drop(weakest).max():.2f} "
@@ -64,14 +68,17 @@ def limits(places: pd.DataFrame) -> Finding:
             [_OBJECTS[kind], f"`{route}`", _count(own["out"])]
             + [f"{value:.0f}" for value in own[_MEDIANS[:2]].median()]
             + [f"{value:.2f}" for value in own[_MEDIANS[2:]].median()]
-            for (kind, route), own in rows.groupby(
-                ["kind", "route"], observed=True, sort=False
-            )
+            for (kind, route), own in by_route
         ],
         draw=lambda figure: draw_reach(figure, rows),
         pandas='drives["kind"] = drives.place.str.split("-").str[1]\n'
         'print(drives.groupby("kind")[["moved", "up_m", "down_m"]].median())',
     )
+
+
+def _medians(by_route: Any) -> Any:
+    """Return the median reach by kind and route, rad/s."""
+    return by_route["moved"].median()
 
 
 def _count(out: pd.Series) -> str:

@@ -58,7 +58,8 @@ def repaired(drives: pd.DataFrame) -> Finding:
     counts = {g: sum(compared[g, e].drives for e in worlds) for g in groups}
     listed = (f"{left[g]} of {counts[g]} ({name})" for g, name in groups.items())
     ratios = (
-        f"It is {one.ratio:.2f} for {name} attacks ({interval_words(one.ends, 2)})."
+        f"For {name} attacks, it is {one.ratio:.2f} in `{where}`, and below 1 at "
+        f"{one.weaker} of {one.places} places ({interval_words(one.ends, 2)})."
         for g, name in groups.items()
         for one in [compared[g, where]]
     )
@@ -67,19 +68,19 @@ def repaired(drives: pd.DataFrame) -> Finding:
         title=_title({group: not count for group, count in left.items()}),
         sentences=(
             "Old attacks were in the training, held-out attacks were not, and adaptive "
-            "attacks were made on the new policy. A group counts as repaired if no "
-            "drive with one of them leaves the lane, in the surrogate and in "
+            "attacks were made on the new policy. The policy stays in its lane near a "
+            "group if no drive leaves the lane, in the surrogate and in "
             f"`{where}`. With the new policy, these drives leave the lane: "
             f"{', '.join(listed)}.",
             "At each place, we divide the error after the retraining by the error "
-            f"before. The geometric mean of these ratios in `{where}` differs from the "
-            f"quotient of the two means. {' '.join(ratios)}",
-            "Two aims were set before the first result: near old attacks, at most "
-            f"{AIMS[ATTACK]} times the error that the old policy has without objects, "
-            f"and without objects, at most {AIMS[NO_OBJECT]} times. The new policy has "
-            f"{errors[ATTACK]:.2f} ({_aim(ATTACK, errors)}) and "
-            f"{errors[NO_OBJECT]:.2f} times ({_aim(NO_OBJECT, errors)}), in the worse "
-            "environment.",
+            "before. The column 'ratio' is the geometric mean over the places, so it "
+            f"is not the quotient of the two means. {' '.join(ratios)}",
+            "We set two aims before the first result, as multiples of the old policy's "
+            "error without objects. Near old attacks, the new policy may have "
+            f"{AIMS[ATTACK]}: it has {errors[ATTACK]:.2f}, and {_aim(ATTACK, errors)}. "
+            f"Without objects, it may have {AIMS[NO_OBJECT]}: it has "
+            f"{errors[NO_OBJECT]:.2f}, and {_aim(NO_OBJECT, errors)}. Both are of the "
+            "worse environment.",
         ),
         head=[
             *("attacks", "environment", "error before (m)", "after (m)", "ratio"),
@@ -96,9 +97,7 @@ def repaired(drives: pd.DataFrame) -> Finding:
         ),
         pandas="own = drives.query(\"case == 'attack'\")\n"
         'print(own.groupby(["group", "environment", "policy"]).departed.mean())',
-        threats=tuple(
-            _doubt(g, compared[g, where], where) for g in groups if g != ADAPTIVE
-        )
+        threats=tuple(_doubt(g, compared[g, where], where) for g in groups)
         + (
             (_ADAPTIVE, _adaptive(compared[ADAPTIVE, where], where))
             if ADAPTIVE in groups
@@ -174,10 +173,9 @@ def _doubt(group: str, one: _Compared, where: str) -> str:
     ends = share_interval(after, one.places)
     low, high = (100 * end for end in ends or (0.0, 1.0))
     return (
-        f"In `{where}`, {GROUPS[group]} attacks make the old policy leave the lane at "
-        f"{before} of {one.places} places, so only there something could be repaired. "
-        f"The new policy leaves the lane at {after} places (share: 95 % interval "
-        f"{low:.0f} to {high:.0f} %)."
+        f"Few places decide about {GROUPS[group]} attacks: in `{where}`, the car "
+        f"leaves the lane at {before} of {one.places} places with the old policy, and "
+        f"at {after} with the new one (share: 95 % interval {low:.0f} to {high:.0f} %)."
     )
 
 
@@ -185,9 +183,8 @@ def _adaptive(one: _Compared, where: str) -> str:
     """Say where new attacks are weaker than old ones, and where cars leave the lane."""
     routes = ", ".join(f"{name} {a} and {b}" for name, (a, b) in one.routes_out.items())
     return (
-        f"In `{where}`, the new attack is weaker than the old one at {one.weaker} of "
-        f"{one.places} places. Drives out by route, with old and new attacks: "
-        f"{routes}."
+        f"In `{where}`, drives out by route, with old attacks on the old policy and "
+        f"new attacks on the new one: {routes}."
     )
 
 
@@ -215,9 +212,9 @@ def _title(is_repaired: dict[str, bool]) -> str:
         for side in (True, False)
     )
     if not good:
-        return "Retraining does not repair the policy against any group of attacks"
-    title = f"Retraining repairs the policy against {good} attacks"
-    return title + (f", not against {bad} attacks" if bad else "")
+        return "The retrained policy leaves its lane near attacks of each group"
+    title = f"The retrained policy stays in its lane near {good} attacks"
+    return title + (f", not near {bad} ones" if bad else "")
 
 
 def _listed(names: list[str]) -> str:

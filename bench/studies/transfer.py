@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import pandas as pd
 
@@ -28,33 +29,33 @@ def transfer(drives: pd.DataFrame) -> Finding:
         one.mean().map(math.exp).unstack(sort=False) for one in (logs, without)
     )
     by_day = heat["day"].drop(SURROGATE)
-    bare = empty["day"].reindex(by_day.index)
+    bare: Any = empty["day"].reindex(by_day.index)
     own = {name: logs[name]["day"] for name in by_day.index}
     ends = {name: geometric_interval(one.to_numpy()) for name, one in own.items()}
     above, lost = _above(own), sum(one[1] < HALF for one in ends.values() if one)
     count = len(by_day)
-    title = (
-        f"By day, the best attacks keep over half of their error in {above} of {count} "
-        f"environments, under half in {lost}"
-    )
+    mean, out = _totals(drives)
     return Finding(
-        title=title,
+        title=f"By day, the best attacks keep {_range(by_day)} of their error",
         sentences=(
-            "The mean distance from the lane centre with the attack, divided by the "
-            f"same in the surrogate, is by day {_range(by_day)}.",
-            f"In {count - above - lost} environments, the 95 % interval of this ratio "
-            "contains one half.",
-            f"The ratios are geometric means over {len(logs)} places with "
-            f"{drives['attack'].nunique()} attacks, and attacks at one place count as "
-            "one value.",
+            "What an attack keeps is the mean distance from the lane centre, divided "
+            "by the same in the surrogate by day. The table has geometric means over "
+            f"{len(logs)} places with {drives['attack'].nunique()} attacks. Attacks at "
+            "one place count as one value.",
+            f"The 95 % interval lies above one half in {above} of {count} "
+            f"environments, below one half in {lost}, and contains one half in "
+            f"{count - above - lost}.",
+            "The quotient of the mean errors gives strong attacks more weight. In "
+            f"`{mean.idxmin()}`, it is {mean.min():.2f}.",
         ),
         head=[
-            *("environment, by day", "error, divided by the surrogate's"),
-            *("95 % interval", "the same without objects"),
+            *("environment, by day", "keeps", "95 % interval", "floor: no objects"),
+            *("quotient of the mean errors", "drives out of the lane"),
         ],
         rows=[
-            [str(n), f"{x:.2f}", ends_cell(ends.get(n), 2), f"{y:.2f}"]
-            for (n, x), y in zip(by_day.items(), bare, strict=True)
+            [str(n), f"{x:.2f}", ends_cell(ends.get(n), 2), f"{bare[n]:.2f}"]
+            + [f"{mean[n]:.2f}", out[n]]
+            for n, x in by_day.items()
         ],
         draw=lambda figure: draw_heat(figure, heat),
         pandas="own = drives.query(\"case == 'attack' and condition == 'day'\")\n"
@@ -62,7 +63,8 @@ def transfer(drives: pd.DataFrame) -> Finding:
         threats=(
             "A grey cell of the chart means: no drive exists. "
             "[transfer](../../reference/transfer.md) explains the labels.",
-            _size(drives),
+            f"The median error in the surrogate is {_median(drives):.2f} m by day, and "
+            f"{out[SURROGATE]} drives leave the lane there.",
             *_decisive_places(own, above),
         ),
     )
@@ -79,23 +81,29 @@ def _range(by_day: pd.Series) -> str:
     built = by_day.index.str.endswith("built_in")
     sides = {"pasted": by_day[~built], "built-in": by_day[built]}
     words = [
-        f"{one.min():.2f} to {one.max():.2f} for {name} objects"
+        f"{one.min():.2f} to {one.max():.2f} ({name})"
         for name, one in sides.items()
         if len(one)
     ]
-    return " and ".join(words)
+    return ", ".join(words)
 
 
-def _size(drives: pd.DataFrame) -> str:
-    """Say how large the errors are of which the page gives shares."""
-    by_day = drives[(drives["condition"] == "day") & (drives["case"] == ATTACK)]
-    own = by_day[by_day["environment"] == SURROGATE]
-    left = by_day.groupby("environment", sort=False)["departed"].sum()
-    counts = ", ".join(f"`{name}` {count}" for name, count in left.items())
-    return (
-        f"The median error in the surrogate is {own[ERROR].median():.2f} m by day. Of "
-        f"the {len(own)} drives in each environment, these leave the lane: {counts}."
-    )
+def _attacks_by_day(drives: pd.DataFrame) -> pd.DataFrame:
+    return drives[(drives["condition"] == "day") & (drives["case"] == ATTACK)]
+
+
+def _median(drives: pd.DataFrame) -> float:
+    """Return the median error in the surrogate by day, metres."""
+    own = _attacks_by_day(drives)
+    return float(own[own["environment"] == SURROGATE][ERROR].median())
+
+
+def _totals(drives: pd.DataFrame) -> tuple[Any, dict[Any, str]]:
+    """Return the quotients of the mean errors, and the drives out, by environment."""
+    by_environment = _attacks_by_day(drives).groupby("environment", sort=False)
+    means, left = by_environment[ERROR].mean(), by_environment["departed"]
+    out = {str(n): f"{own.sum()} of {len(own)}" for n, own in left}
+    return means.drop(SURROGATE) / means[SURROGATE], out
 
 
 def _decisive_places(logs: Mapping[str, pd.Series], above: int) -> Iterator[str]:
@@ -105,8 +113,8 @@ def _decisive_places(logs: Mapping[str, pd.Series], above: int) -> Iterator[str]
         count = _above({name: one.drop((route, seed)) for name, one in logs.items()})
         if count != above:
             yield (
-                f"One place decides about the title: without {route} {seed}, the "
-                f"attacks keep over half in {count} of {len(logs)} environments."
+                f"One place decides: without {route} {seed}, the 95 % interval lies "
+                f"above one half in {count} of {len(logs)} environments."
             )
 
 

@@ -53,9 +53,8 @@ _OF_LIGHT = (
     "scene falls on the objects in the `built_in` rows only.",
 )
 _HEAD_OF_LIGHT = (
-    *("environment", "condition", "`vary` keeps", "95 % interval", "aim"),
-    *("`plain` keeps", "without objects, divided by the surrogate's error with `vary`"),
-    "error of `vary`, divided by that of `plain`, 95 % interval",
+    *("environment", "condition", "aim", "`vary` keeps", "95 % interval", "floor"),
+    *("`plain` keeps", "95 % interval", "`vary` to `plain`", "95 % interval"),
 )
 
 
@@ -68,17 +67,22 @@ def light(drives: pd.DataFrame) -> Finding:
     log_shares = logs.sub(base, axis=0).drop(columns=[(SURROGATE, "day")])
     shares, of_plain = _means(log_shares, VARY), _means(log_shares, PLAIN)
     bare, gains = _means(without.sub(base, axis=0), VARY), _gains(logs)
-    ends_of_vary = _ends(log_shares, VARY)
+    ratios = {place: math.exp(own.mean()) for place, own in _differences(logs).items()}
+    ends, ends_of_plain = _ends(log_shares, VARY), _ends(log_shares, PLAIN)
     aims = {(x, y): AIMS[x] if y == "day" else _OTHER_LIGHT for x, y in shares}
     rows = []
     for place, share in shares.items():
-        figures = share, aims[place], of_plain.get(place), bare.get(place)
-        cells = ["–" if x is None else f"{x:.2f}" for x in figures]
-        cells.insert(1, ends_cell(ends_of_vary.get(place), 2))
-        rows.append([*place, *cells, ends_cell(gains.get(place), 2)])
+        cells = [
+            *(f"{aims[place]:.2f}", f"{share:.2f}", ends_cell(ends.get(place), 2)),
+            *(_cell(bare.get(place)), _cell(of_plain.get(place))),
+            *(ends_cell(ends_of_plain.get(place), 2), _cell(ratios.get(place))),
+            ends_cell(gains.get(place), 2),
+        ]
+        rows.append([*place, *cells])
     missed = [f"`{x}` {y}" for (x, y), aim in aims.items() if shares[x, y] < aim]
     reached = sum(of_plain[place] >= aims[place] for place in of_plain)
-    helps = sum(low > 1 for low, _ in filter(None, map(gains.get, shares)))
+    known = list(filter(None, map(gains.get, shares)))
+    helps, harms = sum(low > 1 for low, _ in known), sum(high < 1 for _, high in known)
     heat: Any = pd.Series(shares).unstack(sort=False)
     count, met = len(shares), len(shares) - len(missed)
     of_method = with_labels(drives).groupby("method")["attack"].nunique()
@@ -86,31 +90,32 @@ def light(drives: pd.DataFrame) -> Finding:
         f"{of_method.get(name, 0)} attacks with `{name}`" for name in (VARY, PLAIN)
     )
     return Finding(
-        title=f"`vary` helps attacks in {helps} of {count} environments and lights. "
-        f"It reaches {met} aims, and `plain` {reached}",
+        title=f"In {count} environments and lights, attacks keep "
+        f"{min(shares.values()):.2f} to {max(shares.values()):.2f} of their error, and "
+        f"`vary` helps in {helps}",
         sentences=(
             "`vary` searches with light, camera and vehicle that differ from start to "
-            "start. `plain` searches with those of the capture. The column '`vary` "
-            "keeps' has the error with the attack in the environment, divided by the "
-            "error in the surrogate by day (geometric mean over places with one start "
-            f"each). The table has {attacks}.",
+            "start. `plain` searches with those of the capture. What an attack keeps "
+            "is its error in the environment, divided by its error in the surrogate by "
+            "day (geometric mean over places with one start each). The floor is the "
+            "same with the error without objects and the attack of `vary`. The table "
+            f"has {attacks}.",
             f"`vary` reaches the aim in {met} of {count} rows"
             + (f", and misses it in {', '.join(missed)}. " if missed else ". ")
             + f"`plain` reaches the aim in {reached} rows. The 95 % intervals are "
-            f"wide: all of the interval reaches the aim in {_sure(ends_of_vary, aims)} "
-            f"rows with `vary` and in {_sure(_ends(log_shares, PLAIN), aims)} with "
-            "`plain`.",
-            "`vary` helps where the 95 % interval of the ratio of its error to that of "
-            "`plain` lies above 1. An interval that contains 1 shows neither help nor "
-            "harm."
+            f"wide: all of the interval reaches the aim in {_sure(ends, aims)} "
+            f"rows with `vary` and in {_sure(ends_of_plain, aims)} with `plain`.",
+            "`vary` helps where the 95 % interval of its error, divided by that of "
+            f"`plain`, lies above 1. It does so in {helps} rows. It lies below 1 in "
+            f"{harms}, and contains 1 in the others, which shows neither help nor harm."
             if gains
             else "No place has an attack of both kinds, so the last column is empty.",
         ),
         head=_HEAD_OF_LIGHT,
         rows=rows,
         draw=lambda figure: draw_heat(figure, heat),
-        pandas="own = drives.query(\"case == 'attack'\")\n"
-        'print(own.pivot_table("cross_track_mean_m", "environment", "condition"))',
+        pandas='by = [drives.attack.str.split(\'-\').str[-3], "case", "environment"]\n'
+        'print(drives.groupby([*by, "condition"]).cross_track_mean_m.mean().unstack())',
         threats=(*_OF_LIGHT, *_farther(logs), _stayed(drives, log_shares)),
     )
 
@@ -122,10 +127,8 @@ def _sure(ends: Mapping[Where, Interval], aims: Mapping[Where, float]) -> int:
 
 def _farther(logs: Any) -> Iterator[str]:
     """Yield where one of both moves the car farther, by the rule that counts places."""
-    if not _gains(logs):
-        return
-    differences: Any = (logs.loc[PLAIN] - logs.loc[VARY]).dropna()
-    for name, signed in ((PLAIN, differences), (VARY, -differences)):
+    differences = _differences(logs)
+    for name, signed in ((PLAIN, -differences), (VARY, differences)):
         counts = (signed > 0).sum()
         listed = ", ".join(
             f"`{x}` {y} ({count} of {len(signed)})"
@@ -134,7 +137,7 @@ def _farther(logs: Any) -> Iterator[str]:
         )
         if listed:
             yield (
-                f"The [rule that counts places](index.md#the-rules) differs: "
+                "By the [rule that counts places](index.md#the-rules), "
                 f"`{name}` moves the car farther in {listed}."
             )
 
@@ -148,10 +151,11 @@ def _stayed(drives: pd.DataFrame, log_shares: pd.DataFrame) -> str:
     left, there = out[SURROGATE, "day"], out[where, "day"]
     stays = left & ~there
     others = math.exp(by_day[where][~stays].mean())
+    few = f"at all {left.sum()}" if stays.sum() == left.sum() else f"at {stays.sum()}"
     return (
         f"A few places decide about a mean: with `vary`, the car leaves the lane at "
         f"{left.sum()} places in the surrogate by day. In `{where}` by day, it stays "
-        f"in the lane at {stays.sum()} of them. The attacks at the other "
+        f"in the lane {few} of them. The attacks at the other "
         f"{(~stays).sum()} places keep {others:.2f} there; we looked at this share "
         "after we had the rows."
     )
@@ -172,12 +176,21 @@ def _means(logs: pd.DataFrame, method: str) -> dict[Where, float]:
     return {place: math.exp(mean) for place, mean in own.mean().items()}
 
 
-def _gains(logs: pd.DataFrame) -> dict[Where, Interval]:
-    """Return the interval of the ratio of `vary` to `plain`, paired by place."""
+def _differences(logs: pd.DataFrame) -> Any:
+    """Return the logarithm of the ratio of `vary` to `plain` at each place."""
     methods = set(logs.index.get_level_values("method"))
     if not {PLAIN, VARY} <= methods:
-        return {}
-    return _intervals((logs.loc[VARY] - logs.loc[PLAIN]).dropna())
+        return pd.DataFrame()
+    return (logs.loc[VARY] - logs.loc[PLAIN]).dropna()
+
+
+def _gains(logs: pd.DataFrame) -> dict[Where, Interval]:
+    """Return the interval of the ratio of `vary` to `plain`, paired by place."""
+    return _intervals(_differences(logs))
+
+
+def _cell(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}"
 
 
 def _ends(log_shares: pd.DataFrame, method: str) -> dict[Where, Interval]:

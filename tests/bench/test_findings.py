@@ -102,8 +102,8 @@ def test_the_gradient_is_compared_with_each_search():
     assert "0 of 0 other searches" in answer.sentences[0]
     assert "`single_frame`" in answer.threats[0]
     assert len(answer.threats) == 1 + 6  # places where `blocks` is better
-    assert [row[3] for row in answer.rows] == ["–", "2.00", "0.80", "4.00"]
-    assert [row[6] for row in answer.rows] == ["–", "0.20 m", "-0.10 m", "0.30 m"]
+    assert [row[4] for row in answer.rows] == ["–", "2.00", "0.80", "4.00"]
+    assert [row[7] for row in answer.rows] == ["–", "0.20 m", "-0.10 m", "0.30 m"]
     assert "`blocks`" in answer.sentences[1] and "0 to 6 of 6" in answer.sentences[2]
 
 
@@ -122,14 +122,15 @@ def test_transfer_counts_places_not_attacks():
         )
     ]
     answer = made("transfer", pd.DataFrame(rows))
-    assert "in 1 of 2 environments, under half in 1" in answer.title
-    assert "6 places with 12 attacks" in answer.sentences[2]
-    assert "0.20 to 0.80 for pasted objects." in answer.sentences[0]
-    assert "`surrogate` 0, `kept` 12, `lost` 0" in answer.threats[1]
+    assert answer.title.endswith("keep 0.20 to 0.80 (pasted) of their error")
+    assert "6 places with 12 attacks" in answer.sentences[0]
+    assert "in 1 of 2 environments, below one half in 1," in answer.sentences[1]
+    assert "In `lost`, it is 0.25." in answer.sentences[2]
+    assert "0 of 12 drives leave the lane there" in answer.threats[1]
     assert len(answer.threats) == 2
     assert answer.rows == [
-        ["kept", "0.80", "0.80 to 0.80", "0.10"],
-        ["lost", "0.20", "0.20 to 0.20", "0.10"],
+        ["kept", "0.80", "0.80 to 0.80", "0.10", "1.00", "12 of 12"],
+        ["lost", "0.20", "0.20 to 0.20", "0.10", "0.25", "0 of 12"],
     ]
 
     # without one of six places, which lost all, the others would count
@@ -137,9 +138,9 @@ def test_transfer_counts_places_not_attacks():
     lost = table["attack"].str.endswith("-4-0") & (table["environment"] == "kept")
     table.loc[lost, "cross_track_mean_m"] = 1e-9
     answer = made("transfer", table)
-    assert "in 0 of 2 environments" in answer.title
+    assert "in 0 of 2 environments" in answer.sentences[1]
     (threat,) = answer.threats[2:]
-    assert "without left 4, the attacks keep over half in 1 of 2" in threat
+    assert "without left 4, the 95 % interval lies above one half in 1 of 2" in threat
     five = table[~table["attack"].str.contains("-5-")]  # four have no interval
     assert not made("transfer", five).threats[2:]
 
@@ -163,8 +164,9 @@ def test_light_counts_aims_and_where_varying_helps():
     where |= {("mujoco_built_in", "day"): 0.72, ("mitsuba", "evening"): 0.59}
     rows = light_rows({"plain": 1.0, "vary": 2.0}, where)
     answer = made("light", rows)
-    assert "helps attacks in 3 of 3" in answer.title
-    assert answer.title.endswith("It reaches 1 aims, and `plain` 1")
+    assert "keep 0.59 to 0.88 of their error" in answer.title
+    assert answer.title.endswith("and `vary` helps in 3")
+    assert "It lies below 1 in 0, and" in answer.sentences[2]
     assert "`plain` reaches the aim in 1 rows." in answer.sentences[1]
     assert "in 1 rows with `vary` and in 1 with" in answer.sentences[1]
     assert (
@@ -173,22 +175,25 @@ def test_light_counts_aims_and_where_varying_helps():
     assert "5 attacks with `vary` and 5 attacks with `plain`" in answer.sentences[0]
     missed = "misses it in `mitsuba` day, `mitsuba` evening."
     assert missed in answer.sentences[1] and "in 1 of 3 rows" in answer.sentences[1]
-    by_place = {tuple(row[:2]): row[2:7] for row in answer.rows}
-    assert {place: [row[0], *row[2:]] for place, row in by_place.items()} == {
-        ("mitsuba", "day"): ["0.88", "0.90", "0.88", "0.22"],
-        ("mujoco_built_in", "day"): ["0.72", "0.70", "0.72", "0.18"],
-        ("mitsuba", "evening"): ["0.59", "0.60", "0.59", "0.15"],
+    by_place = {tuple(row[:2]): row[2:] for row in answer.rows}
+    # aim, what `vary` keeps, floor, what `plain` keeps, both compared
+    assert {x: [*row[:2], *row[3:5], row[6]] for x, row in by_place.items()} == {
+        ("mitsuba", "day"): ["0.90", "0.88", "0.22", "0.88", "2.00"],
+        ("mujoco_built_in", "day"): ["0.70", "0.72", "0.18", "0.72", "2.00"],
+        ("mitsuba", "evening"): ["0.60", "0.59", "0.15", "0.59", "2.00"],
     }
-    for share, ends, *_ in by_place.values():
-        assert ends in (f"{share} to {share}", f"{share} to {float(share) + 0.01:.2f}")
-    assert {row[7] for row in answer.rows} == {"2.00 to 2.01"}
+    for _, share, *others in by_place.values():
+        expected = f"{share} to {share}", f"{share} to {float(share) + 0.01:.2f}"
+        assert others[0] in expected
+        assert others[3] in (*expected, "–")  # where rounding alone differs
+    assert {row[-1] for row in answer.rows} == {"2.00 to 2.01"}
     threat = answer.threats[-1]
-    assert "leaves the lane at 2 places" in threat and "lane at 2 of them" in threat
+    assert "leaves the lane at 2 places" in threat and "at all 2 of them" in threat
     assert "The attacks at the other 3 places keep 0.72 there" in threat
     alone = made("light", rows[rows["attack"].str.contains("vary")])
-    assert "helps attacks in 0 of 3" in alone.title
+    assert alone.title.endswith("and `vary` helps in 0")
     assert "0 attacks with `plain`" in alone.sentences[0]
-    assert {row[7] for row in alone.rows} == {"–"}
+    assert {cell for row in alone.rows for cell in row[-4:]} == {"–"}
 
 
 def test_the_second_place_has_the_rule_of_the_first():
@@ -200,7 +205,7 @@ def test_the_second_place_has_the_rule_of_the_first():
     rows.loc[rows["case"] == "attack", "departed"] = True
     left = made("country", rows)
     assert left.title == f"{road}and out of its lane in 6 of 6 drives"
-    assert "at 6 of 6 places. " in left.sentences[1]
+    assert "at 6 of 6 places (share: 95 % interval 0.61" in left.sentences[1]
 
 
 def test_the_parts_of_varying_are_compared_with_nothing():
@@ -288,28 +293,29 @@ def retrained(departed: bool) -> pd.DataFrame:
 
 def test_a_policy_is_repaired_where_no_drive_leaves_the_lane():
     answer = made("repaired", retrained(departed=True))
-    words = "against old and held-out attacks, not against adaptive attacks"
+    words = "in its lane near old and held-out attacks, not near adaptive ones"
     assert answer.title.endswith(words)
     left = "0 of 10 (old), 0 of 10 (held-out), 10 of 10 (adaptive)."
     assert answer.sentences[0].endswith(left)
     _, errors, aims = answer.sentences
-    assert "It is 0.25 for old" in errors and "It is 0.75 for adaptive" in errors
-    assert "The new policy has 0.25 (reaches the aim) and 1.10 times" in aims
+    assert "For old attacks, it is 0.25" in errors
+    assert "For adaptive attacks, it is 0.75" in errors
+    assert "below 1 at 5 of 5 places" in errors
+    assert "it has 0.25, and reaches the aim. " in aims
+    assert "it has 1.10, and reaches the aim. " in aims
     assert answer.rows[5] == [
         *("adaptive (5)", "`mitsuba`", "3.000", "2.250", "0.75", "0.75 to 0.75"),
         *("5/5", "5/5"),
     ]
-    old, held_out, _, adaptive = answer.threats
-    assert "the old policy leave the lane at 5 of 5 places" in old
-    assert "new policy leaves the lane at 0 places (share: 95 %" in held_out
-    assert adaptive == (
-        "In `mitsuba`, the new attack is weaker than the old one at 5 of 5 places. "
-        "Drives out by route, with old and new attacks: left 5 and 5."
-    )
+    old, held_out, adaptive, _, routes = answer.threats
+    assert "leaves the lane at 5 of 5 places with the old policy" in old
+    assert "and at 0 with the new one (share: 95 %" in held_out
+    assert "and at 5 with the new one" in adaptive
+    assert routes.endswith("new attacks on the new one: left 5 and 5.")
     some = retrained(departed=True).query("group != 'adaptive'")
-    assert made("repaired", some).title.endswith("against old and held-out attacks")
+    assert made("repaired", some).title.endswith("near old and held-out attacks")
     good = made("repaired", retrained(departed=False))
-    assert good.title.endswith("against old, held-out and adaptive attacks")
+    assert good.title.endswith("near old, held-out and adaptive attacks")
 
 
 def test_limits_counts_places_beyond_the_lane():
@@ -330,7 +336,7 @@ def test_limits_counts_places_beyond_the_lane():
         ["a billboard", "`left`", "0 of 2"],
         ["a patch", "`left`", "2 of 2"],
     ]
-    assert "2 of 2 places with a patch" in answer.sentences[1]
+    assert "With a patch, 2 of 2 places count." in answer.sentences[1]
     assert "medians of 0.20 to 0.20 rad/s" in answer.sentences[2]
     assert "where the reach is over 0.200 rad/s" in answer.sentences[2]
 

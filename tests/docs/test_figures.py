@@ -85,7 +85,7 @@ def test_the_results_of_the_readme_equal_their_rows():
     assert f"worst random texture: {' against '.join(medians)}" in readme
 
     page = (ROOT / "docs/results/findings/transfer.md").read_text("utf-8")
-    assert "0.21 to 0.35 for built-in objects" in " ".join(page.split())
+    assert "0.21 to 0.35 (built-in)" in " ".join(page.split())
     assert "[0.21 to 0.35 of the error](docs/results/findings/transfer.md)" in readme
     drives = pd.read_csv(ROOT / "docs/results/matrix/drives.csv")
     lit = drives[drives["environment"].str.endswith("_built_in")]
