@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import pandas as pd
 
-from bench.studies.charts import draw_ratios
+from bench.studies.charts import draw_searches
 from bench.studies.content import (
     ERROR,
     Finding,
@@ -20,13 +20,13 @@ from bench.studies.content import (
 from bench.studies.plan import ROOT
 from mi_nerfattack.evaluation.summary import Interval
 from mi_nerfattack.io import files
-from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT
+from mi_nerfattack.rollout.drive import ATTACK, OWN
 from mi_nerfattack.scenario.deployment import SURROGATE
 
 FIELDS = ROOT / "bench/fit_quality/fields"
 #: The method that attacks in the bundled field.
 BEST = "steps_12000"
-THREATS = (
+_THREATS = (
     "An interval that contains 1 does not show that two fields are equally good.",
     "All fields are from the same 384 views with depth. A field from fewer views has "
     "other faults.",
@@ -46,26 +46,29 @@ def fit_quality(
     inside, deployed = (
         _errors(drives, environment, ATTACK) for environment in (SURROGATE, where)
     )
-    bare = _errors(drives, SURROGATE, NO_OBJECT)
-    names = list(deployed.index)
+    own, out = _errors(drives, SURROGATE, OWN), _out(drives, where, ATTACK)
+    names, count = list(deployed.index), _count(drives, where)
     psnr = {name: _psnr(name) for name in names} if psnr is None else psnr
     logs = deployed.map(math.log)
     transfer, gains = logs - inside.map(math.log), logs - logs.loc[BEST]
     ratios = {name: _mean(gains.loc[name]) for name in names if name != BEST}
-    poor = [n for n, (_, ends) in ratios.items() if ends is not None and ends[1] < 1]
+    poor = _below(gains)
     worst = min(ratios, key=lambda name: psnr[name])
     rows = [
         [
             *(f"`{name}`", f"{psnr[name]:.1f}"),
-            *(f"{errors.loc[name].mean():.3f}" for errors in (bare, inside, deployed)),
-            f"{_mean(transfer.loc[name])[0]:#.2g}",
+            *(f"{errors.loc[name].mean():.3f}" for errors in (own, inside, deployed)),
+            *_cells(_mean(transfer.loc[name])),
             *_cells(ratios.get(name)),
+            f"{out.loc[name].sum()} of {count}",
         ]
         for name in names
     ]
     shares = ", ".join(f"{_mean(transfer.loc[n])[0]:#.2g} (`{n}`)" for n in names)
+    errors = deployed.set_axis([f"{n}, {psnr[n]:.1f} dB" for n in names])
+    errors.columns = [f"{route} {seed}" for route, seed in deployed.columns]
     has_intervals = any(ends is not None for _, ends in ratios.values())
-    listed = ", ".join(f"`{name}`" for name in poor) or "none of them"
+    listed = _listed(poor) or "none of them"
     return Finding(
         title=_title(len(poor), len(ratios), ratios[worst][0], psnr=psnr[worst]),
         sentences=(
@@ -74,23 +77,24 @@ def fit_quality(
             f"({deployed.shape[1]} places, geometric mean, "
             f"{interval_words(ratios[worst][1], 2)}).",
             "The error there, divided by the error in the field, is "
-            f"(geometric mean) {shares}.",
-            "A field is too poor if the interval of its ratio lies below 1. "
+            f"(geometric mean) {shares}. Its interval lies below 1 for "
+            f"{_listed(_below(transfer)) or 'none of them'}.",
+            "The rule calls a field too poor if the interval of the error, divided by "
+            f"that from `{BEST}`, lies below 1. "
             + (f"This holds for {listed}." if has_intervals else "None has one yet."),
         ),
         head=[
-            *("field", "PSNR along the routes (dB)", "no object, in the field (m)"),
-            *("attack, in the field (m)", f"attack, `{where}` (m)"),
-            f"`{where}` to field",
+            *("field", "PSNR along the routes (dB)"),
+            *("original texture, in the field (m)", "attack, in the field (m)"),
+            *(f"attack, `{where}` (m)", f"`{where}` to field", "95 % interval"),
             *(f"`{where}`, ratio to `{BEST}`", "95 % interval"),
+            f"drives out of the lane, `{where}`",
         ],
         rows=rows,
-        draw=lambda figure: draw_ratios(
-            figure, {f"{n}, {psnr[n]:.1f} dB": ratio for n, ratio in ratios.items()}
-        ),
+        draw=lambda figure: draw_searches(figure, errors),
         pandas="attacks = drives.query(\"case == 'attack'\")\n"
         'print(attacks.pivot_table("cross_track_mean_m", "method", "environment"))',
-        threats=THREATS,
+        threats=(*_threats(out, _out(drives, SURROGATE, OWN)), *_THREATS),
     )
 
 
@@ -105,6 +109,55 @@ def _title(poor: int, fields: int, ratio: float, psnr: float) -> str:
         f"Attacks from {poor} of {fields} poorer fields are weaker in the path-traced "
         f"scene: {ratio:.2f} times at {psnr:.1f} dB"
     )
+
+
+def _below(logs: pd.DataFrame) -> list[str]:
+    """Return the fields whose interval of a geometric mean lies below 1."""
+    ends = {str(name): _mean(own)[1] for name, own in logs.iterrows()}
+    return [name for name, one in ends.items() if one is not None and one[1] < 1]
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(f"`{name}`" for name in names)
+
+
+def _threats(out: Any, own: Any) -> Iterator[str]:
+    """Yield where cars leave the lane.
+
+    Args:
+        out: by method and place, drives with the attack in the deployment.
+        own: as `out`, with the original textures in the field.
+    """
+    failed = [str(name) for name, places in own.iterrows() if places.any()]
+    if failed:
+        yield (
+            f"In the field of {_listed(failed)}, the policy leaves its lane with the "
+            "original textures, too. `check` refuses an attack in such a field."
+        )
+    at = [
+        f"{route} {seed} (`{'`, `'.join(column[column > 0].index)}`)"
+        for (route, seed), column in out.items()
+        if column.any() and not column[BEST]
+    ]
+    if at:
+        yield (
+            "A few places decide about the means. With attacks from poorer fields, but "
+            f"not from `{BEST}`, the car leaves the lane at {', '.join(at)}. The "
+            "search is local, so another field leads it to another texture."
+        )
+
+
+def _out(drives: pd.DataFrame, environment: str, case: str) -> Any:
+    """Return the drives that leave the lane, by method and place."""
+    own = drives[(drives["environment"] == environment) & (drives["case"] == case)]
+    where = ["route", "seed"]
+    return own.pivot_table("departed", "method", where, aggfunc="sum", sort=False)
+
+
+def _count(drives: pd.DataFrame, environment: str) -> int:
+    """Return the number of drives with the attack from each field."""
+    own = drives[(drives["environment"] == environment) & (drives["case"] == ATTACK)]
+    return int(own.groupby("method").size().max())
 
 
 def _errors(drives: pd.DataFrame, environment: str, case: str) -> pd.DataFrame:

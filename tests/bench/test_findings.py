@@ -245,9 +245,7 @@ def test_a_field_is_too_poor_if_the_interval_of_its_ratio_lies_below_one():
     places, spread = np.linspace(0.2, 0.4, 6), np.geomspace(0.9, 1 / 0.9, 6)
     shares = {"steps_300": spread / 2, "steps_3000": spread, "steps_12000": 1.0}
     sides = [
-        table(
-            {"attack": list(share * places * scale), "no_object": [0.1] * 6}, **labels
-        )
+        table({"attack": list(share * places * scale), "own": [0.1] * 6}, **labels)
         for method, share in shares.items()
         for environment, scale in (("surrogate", 2.0), ("mitsuba", 1.0))
         for labels in [{"method": method, "environment": environment}]
@@ -260,10 +258,20 @@ def test_a_field_is_too_poor_if_the_interval_of_its_ratio_lies_below_one():
     )
     assert answer.sentences[2].endswith("This holds for `steps_300`.")
     assert answer.rows[0][:3] == ["`steps_300`", "20.0", "0.100"]
-    assert answer.rows[0][5:7] == ["0.50", "0.50"]
-    assert answer.rows[2][-2:] == ["1", "–"]
+    assert answer.rows[0][5:8] == ["0.50", "0.50 to 0.50", "0.50"]
+    assert answer.rows[2][-3:] == ["1", "–", "0 of 6"]
+    assert len(answer.threats) == 2
     few = fit_quality(rows[rows["seed"].isin(rows["seed"].unique()[:2])], psnr)
     assert few.sentences[2].endswith("lies below 1. None has one yet.")
+    left = (rows["method"] == "steps_300") & (rows["environment"] == "mitsuba")
+    rows.loc[left & (rows["seed"] == rows["seed"].max()), "departed"] = True
+    threat, *_ = fit_quality(rows, psnr).threats
+    assert "(`steps_300`)" in threat and "not from `steps_12000`" in threat
+    failed = (rows["case"] == "own") & (rows["method"] == "steps_300")
+    rows["departed"] = rows["departed"].to_numpy() | failed.to_numpy()
+    assert (
+        "In the field of `steps_300`, the policy" in fit_quality(rows, psnr).threats[0]
+    )
     better = psnr | {"steps_300": 29.0}
     assert "1.00 times" in fit_quality(rows, better).title
     level = rows[rows["method"] != "steps_300"]
