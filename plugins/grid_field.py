@@ -93,11 +93,11 @@ class GridFieldVolume(AbstractFieldVolume):
     light pass more than a centimetre (0.7 %).
 
     ``colour`` represents the texture of all levels: a step of an optimiser is a change
-    of colour by that step. Keep it above 0 and below 1, for instance by ``dr.clip(colour, 0.01, 0.99)``. Where
-    the file calls space empty, the density is 0 whatever ``density`` says: see
-    ``fields.occupancy``. A new ``to_world`` moves the field, except in media.
-    Derivatives by it are in backward mode alone, and need an empty cell: else the
-    density ends at the faces of the field's box at once.
+    of colour by that step. Keep it above 0 and below 1, for instance by
+    ``dr.clip(colour, 0.01, 0.99)``. Where the file calls space empty, the density is 0
+    whatever ``density`` says: see ``fields.occupancy``. A new ``to_world`` moves the
+    field, except in media. Derivatives by it are in backward mode alone, and need an
+    empty cell: else the density ends at the faces of the field's box at once.
     """
 
     kind = "grid_field"

@@ -224,8 +224,10 @@ def flat(drives: pd.DataFrame) -> Finding:
     percent = f"{100 * shares[CASES[ATTACK]]:.0f} %"
     title = f"Flat objects send the car out of its lane in {percent} of the drives"
     kinds = summary(own, ["objects", "case"], ["cell"])
-    sides = own[own["case"] == ATTACK], own[own["case"] == BEST_RANDOM]
-    (farther, _), effect = is_farther(*sides), compare(*sides, ERROR)
+    by_case = dict(list(own.groupby("case")))
+    attacks, randoms = by_case[ATTACK], by_case[BEST_RANDOM]
+    farther, _ = is_farther(attacks, randoms)
+    effect = compare(attacks, randoms, ERROR)
     return Finding(
         title=title,
         sentences=(

@@ -114,7 +114,7 @@ def light(drives: pd.DataFrame) -> Finding:
         head=_HEAD_OF_LIGHT,
         rows=rows,
         draw=lambda figure: draw_heat(figure, heat),
-        pandas='by = [drives.attack.str.split(\'-\').str[-3], "case", "environment"]\n'
+        pandas='by = [drives.attack.str.split("-").str[-3], "case", "environment"]\n'
         'print(drives.groupby([*by, "condition"]).cross_track_mean_m.mean().unstack())',
         threats=(*_OF_LIGHT, *_farther(logs), _stayed(drives, log_shares)),
     )

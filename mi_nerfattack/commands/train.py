@@ -70,7 +70,7 @@ class Train:
     start: Path | None = None
     """Policy with the first weights, also bundled:FILE."""
     skies: tuple[str, ...] = ()
-    """Times of day, as of evaluate; by default the preset's, day for --scene."""
+    """Times of day, as of evaluate; all, or day for --scene."""
     exposures_ev: tuple[float, ...] = ()
     """Exposures of rendered frames, in powers of two."""
     spp: int = 4

@@ -179,19 +179,19 @@ def test_what_varied_attacks_keep_equals_their_rows():
     text = " ".join((ROOT / "docs/howto/robust.md").read_text("utf-8").split())
     for column, words in (
         (
-            5,
+            6,
             "such attacks kept {} of their error when the path-traced scene lit the "
             "objects, and {} with MuJoCo's car there",
         ),
         (
-            2,
+            3,
             "attacks kept {} of their error when the path-traced scene lit the "
             "objects, but only {} with MuJoCo's car there",
         ),
     ):
         cells = (by_day[f"{name}_built_in"][column] for name in ("mitsuba", "mujoco"))
         assert words.format(*cells) in text
-    assert len(rows) == 16 and all(float(row[7].split()[0]) <= 1 for row in rows)
+    assert len(rows) == 16 and all(float(row[9].split()[0]) <= 1 for row in rows)
     assert "In none of 16 environments and lights is the difference shown" in text
 
 
