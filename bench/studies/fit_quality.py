@@ -67,27 +67,31 @@ def fit_quality(
     shares = ", ".join(f"{_mean(transfer.loc[n])[0]:#.2g} (`{n}`)" for n in names)
     errors = deployed.set_axis([f"{n}, {psnr[n]:.1f} dB" for n in names])
     errors.columns = [f"{route} {seed}" for route, seed in deployed.columns]
+    weaker = int((gains.loc[worst] < 0).sum())
     has_intervals = any(ends is not None for _, ends in ratios.values())
     listed = _listed(poor) or "none of them"
     return Finding(
         title=_title(len(poor), len(ratios), ratios[worst][0], psnr=psnr[worst]),
         sentences=(
-            f"In the path-traced scene, attacks from `{worst}` have "
-            f"{ratios[worst][0]:.2f} times the error of attacks from `{BEST}` "
-            f"({deployed.shape[1]} places, geometric mean, "
-            f"{interval_words(ratios[worst][1], 2)}).",
-            "The error there, divided by the error in the field, is "
-            f"(geometric mean) {shares}. Its interval lies below 1 for "
+            "`steps_N` is the field of the scene after N steps of its fit. In the "
+            f"path-traced scene, attacks from `{worst}` have {ratios[worst][0]:.2f} "
+            f"times the error of attacks from `{BEST}` (geometric mean over "
+            f"{deployed.shape[1]} places, {interval_words(ratios[worst][1], 2)}). They "
+            f"are weaker at {weaker} places.",
+            f"Of its error in the field, an attack keeps {shares} in the path-traced "
+            "scene. The interval of this share lies below 1 for "
             f"{_listed(_below(transfer)) or 'none of them'}.",
-            "The rule calls a field too poor if the interval of the error, divided by "
-            f"that from `{BEST}`, lies below 1. "
-            + (f"This holds for {listed}." if has_intervals else "None has one yet."),
+            "By the rule, a field is too poor if the interval of the ratio to "
+            f"`{BEST}` in the path-traced scene lies below 1. "
+            + (f"This holds for {listed}." if has_intervals else "None has one yet.")
+            + " Metres are arithmetic means and ratios are geometric ones, so one "
+            "large error can reverse their order.",
         ),
         head=[
             *("field", "PSNR along the routes (dB)"),
             *("original texture, in the field (m)", "attack, in the field (m)"),
-            *(f"attack, `{where}` (m)", f"`{where}` to field", "95 % interval"),
-            *(f"`{where}`, ratio to `{BEST}`", "95 % interval"),
+            *(f"attack, `{where}` (m)", "kept of the field's", "95 % interval"),
+            *(f"ratio to `{BEST}`", "95 % interval"),
             f"drives out of the lane, `{where}`",
         ],
         rows=rows,
@@ -102,8 +106,8 @@ def _title(poor: int, fields: int, ratio: float, psnr: float) -> str:
     """Return the title; `ratio` and `psnr` (dB) are those of the poorest field."""
     if not poor:
         return (
-            f"No poorer field is shown to make weaker attacks: at {psnr:.1f} dB, "
-            f"{ratio:.2f} times the error"
+            f"Not shown that a poorer field makes weaker attacks: {ratio:.2f} times "
+            f"the error at {psnr:.1f} dB"
         )
     return (
         f"Attacks from {poor} of {fields} poorer fields are weaker in the path-traced "
@@ -141,9 +145,10 @@ def _threats(out: Any, own: Any) -> Iterator[str]:
     ]
     if at:
         yield (
-            "A few places decide about the means. With attacks from poorer fields, but "
-            f"not from `{BEST}`, the car leaves the lane at {', '.join(at)}. The "
-            "search is local, so another field leads it to another texture."
+            "Few places decide about the means: there, the car leaves the lane with "
+            f" attacks from poorer fields, but not from `{BEST}`: "
+            f"{' and '.join(at)}. The search is local, so another field leads it to "
+            "another texture."
         )
 
 

@@ -256,13 +256,13 @@ def test_a_field_is_too_poor_if_the_interval_of_its_ratio_lies_below_one():
     assert (
         "1 of 2 poorer fields" in answer.title and "0.50 times at 20.0" in answer.title
     )
-    assert answer.sentences[2].endswith("This holds for `steps_300`.")
+    assert "This holds for `steps_300`." in answer.sentences[2]
     assert answer.rows[0][:3] == ["`steps_300`", "20.0", "0.100"]
     assert answer.rows[0][5:8] == ["0.50", "0.50 to 0.50", "0.50"]
     assert answer.rows[2][-3:] == ["1", "–", "0 of 6"]
     assert len(answer.threats) == 2
     few = fit_quality(rows[rows["seed"].isin(rows["seed"].unique()[:2])], psnr)
-    assert few.sentences[2].endswith("lies below 1. None has one yet.")
+    assert "lies below 1. None has one yet." in few.sentences[2]
     left = (rows["method"] == "steps_300") & (rows["environment"] == "mitsuba")
     rows.loc[left & (rows["seed"] == rows["seed"].max()), "departed"] = True
     threat, *_ = fit_quality(rows, psnr).threats
@@ -275,7 +275,7 @@ def test_a_field_is_too_poor_if_the_interval_of_its_ratio_lies_below_one():
     better = psnr | {"steps_300": 29.0}
     assert "1.00 times" in fit_quality(rows, better).title
     level = rows[rows["method"] != "steps_300"]
-    assert fit_quality(level, psnr).title.startswith("No poorer field is shown")
+    assert fit_quality(level, psnr).title.startswith("Not shown that a poorer field")
 
 
 def retrained(departed: bool) -> pd.DataFrame:
