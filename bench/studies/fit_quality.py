@@ -146,7 +146,7 @@ def _threats(out: Any, own: Any) -> Iterator[str]:
     if at:
         yield (
             "Few places decide about the means: there, the car leaves the lane with "
-            f" attacks from poorer fields, but not from `{BEST}`: "
+            f"attacks from poorer fields, but not from `{BEST}`: "
             f"{' and '.join(at)}. The search is local, so another field leads it to "
             "another texture."
         )
