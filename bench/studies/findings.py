@@ -92,6 +92,7 @@ def gradient(drives: pd.DataFrame) -> Finding:
         ((name, fair[name]) for name in without or fair),
         key=lambda item: item[1].ratio or 0.0,
     )
+    closest = f"Of the searches {'without a gradient' if without else 'at equal cost'}"
     wins = [farther[name][0] for name in fair]
     there = _deployed(drives)
     head = [GRADIENT, f"{frames[GRADIENT]:.0f}", f"{nearest.one:.3f}"]
@@ -112,7 +113,7 @@ def gradient(drives: pd.DataFrame) -> Finding:
             f"{nearest.one:.2f} m from the lane centre on average in the surrogate, "
             f"and is farther than {also} of {len(others)} other searches by gradient "
             f"at equal cost ({', '.join(f'`{name}`' for name in others)}).",
-            f"Of the searches without a gradient, `{close}` is the closest: the "
+            f"{closest}, `{close}` is the closest: the "
             f"gradient moves the car {nearest.ratio:.2f} times as far "
             f"({interval_words(nearest.ratio_ci95, 2)}).",
             f"Compared with each of the {len(fair)} searches at equal cost, the "
@@ -288,8 +289,8 @@ def _routes(own: pd.DataFrame) -> str:
         f"{kind} on `{route}` {count}" for (kind, route), count in places.items()
     )
     return (
-        f"The places so far: {counts}. The missing places are not random, because "
-        "routes are missing. Another route may give another share."
+        f"The places so far: {counts}. Places are in the order of the grid, so missing "
+        "ones are not random. Another route may give another share."
     )
 
 

@@ -47,7 +47,7 @@ def fit_quality(
         _errors(drives, environment, ATTACK) for environment in (SURROGATE, where)
     )
     own, out = _errors(drives, SURROGATE, OWN), _out(drives, where, ATTACK)
-    names, count = list(deployed.index), _count(drives, where)
+    names, counts = list(deployed.index), _counts(drives, where)
     psnr = {name: _psnr(name) for name in names} if psnr is None else psnr
     logs = deployed.map(math.log)
     transfer, gains = logs - inside.map(math.log), logs - logs.loc[BEST]
@@ -60,7 +60,7 @@ def fit_quality(
             *(f"{errors.loc[name].mean():.3f}" for errors in (own, inside, deployed)),
             *_cells(_mean(transfer.loc[name])),
             *_cells(ratios.get(name)),
-            f"{out.loc[name].sum()} of {count}",
+            f"{out.loc[name].sum():.0f} of {counts[name]}",
         ]
         for name in names
     ]
@@ -132,12 +132,15 @@ def _threats(out: Any, own: Any) -> Iterator[str]:
         out: by method and place, drives with the attack in the deployment.
         own: as `out`, with the original textures in the field.
     """
-    failed = [str(name) for name, places in own.iterrows() if places.any()]
-    if failed:
-        yield (
-            f"In the field of {_listed(failed)}, the policy leaves its lane with the "
-            "original textures, too. `check` refuses an attack in such a field."
-        )
+    failed = {str(name): places[places > 0] for name, places in own.iterrows()}
+    for name, places in failed.items():
+        if len(places):
+            at = " and ".join(f"{route} {seed}" for route, seed in places.index)
+            yield (
+                f"In the field of `{name}`, the policy leaves its lane with the "
+                f"original textures, too, at {at} ({places.sum():.0f} drives). `check` "
+                "refuses an attack there."
+            )
     at = [
         f"{route} {seed} (`{'`, `'.join(column[column > 0].index)}`)"
         for (route, seed), column in out.items()
@@ -159,10 +162,10 @@ def _out(drives: pd.DataFrame, environment: str, case: str) -> Any:
     return own.pivot_table("departed", "method", where, aggfunc="sum", sort=False)
 
 
-def _count(drives: pd.DataFrame, environment: str) -> int:
-    """Return the number of drives with the attack from each field."""
+def _counts(drives: pd.DataFrame, environment: str) -> Any:
+    """Return the number of drives with the attack, by field."""
     own = drives[(drives["environment"] == environment) & (drives["case"] == ATTACK)]
-    return int(own.groupby("method").size().max())
+    return own.groupby("method").size()
 
 
 def _errors(drives: pd.DataFrame, environment: str, case: str) -> pd.DataFrame:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pandas as pd
@@ -35,15 +36,17 @@ def limits(places: pd.DataFrame) -> Finding:
     by_route = rows.groupby(["kind", "route"], observed=True, sort=False)
     weakest, moved = by_kind["out"].mean().idxmin(), _medians(by_route)
     least, most = moved[weakest].min(), moved[weakest].max()
+    others = [kind for kind, _ in by_kind if kind != weakest]
     original = rows["original_m"] > rows["limit_m"]
     return Finding(
         title=f"If it changed in each frame, {_OBJECTS[weakest]} would take the car "
         f"out of its lane at {_count(by_kind.get_group(weakest)['out'])} places",
         sentences=(
             "In each frame, a local search gives each pixel of the objects the value "
-            "that changes the steering most. The *reach* is this change, in rad/s. Two "
-            "drives per place show these frames to the policy: one always steers more "
-            "to the left, the other one more to the right.",
+            "that changes the steering most. The *reach* of a place is the median of "
+            "this change over the frames of the original drive with the objects in "
+            "view, in rad/s. Two more drives search in each of their own frames: one "
+            "always steers more to the left, the other one more to the right.",
             "A place counts if at least one of the two drives leaves the lane. "
             + " ".join(
                 f"With {_OBJECTS[kind]}, {_count(own['out'])} places count"
@@ -53,9 +56,10 @@ def limits(places: pd.DataFrame) -> Finding:
             + " With the original colours, the car leaves the lane at "
             f"{_count(original)} places.",
             f"The reach of {_OBJECTS[weakest]} has medians of {least:.2f} to "
-            f"{most:.2f} rad/s on the routes, the reach of other objects "
-            f"{moved.drop(weakest).min():.2f} to {moved.drop(weakest).max():.2f} "
-            "rad/s. The largest control of the car is 1.5 rad/s. " + _threshold(rows),
+            f"{most:.2f} rad/s on the routes"
+            + "".join(f", of {_OBJECTS[k]} {_range(moved[k])}" for k in others)
+            + ". The largest control of the car is 1.5 rad/s. "
+            + _threshold(rows),
         ),
         head=[
             *("objects", "route", "places out of the lane"),
@@ -81,6 +85,10 @@ def _medians(by_route: Any) -> Any:
     return by_route["moved"].median()
 
 
+def _range(values: Any) -> str:
+    return f"{values.min():.2f} to {values.max():.2f}"
+
+
 def _count(out: pd.Series) -> str:
     """Say at how many places something holds."""
     return f"{out.sum()} of {len(out)}"
@@ -91,10 +99,12 @@ def _threshold(rows: pd.DataFrame) -> str:
     staying, leaving = rows[~rows["out"]]["moved"], rows[rows["out"]]["moved"]
     if staying.empty or leaving.empty:
         return ""
+    most = math.ceil(1e3 * staying.max()) / 1e3
+    least = math.floor(1e3 * leaving.min()) / 1e3
     return (
-        "The car stays in its lane at no place where the reach is over "
-        f"{staying.max():.3f} rad/s. It leaves its lane at no place where the reach is "
-        f"under {leaving.min():.3f} rad/s."
+        f"The car stays in its lane at no place where the reach is over {most:.3f} "
+        "rad/s. It leaves its lane at no place where the reach is under "
+        f"{least:.3f} rad/s."
     )
 
 

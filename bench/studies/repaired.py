@@ -180,7 +180,7 @@ def _doubt(group: str, one: _Compared, where: str) -> str:
 
 
 def _adaptive(one: _Compared, where: str) -> str:
-    """Say where new attacks are weaker than old ones, and where cars leave the lane."""
+    """Say on which routes cars leave the lane."""
     routes = ", ".join(f"{name} {a} and {b}" for name, (a, b) in one.routes_out.items())
     return (
         f"In `{where}`, drives out by route, with old attacks on the old policy and "

@@ -45,7 +45,8 @@ def transfer(drives: pd.DataFrame) -> Finding:
             f"The 95 % interval lies above one half in {above} of {count} "
             f"environments, below one half in {lost}, and contains one half in "
             f"{count - above - lost}.",
-            "The quotient of the mean errors gives strong attacks more weight. In "
+            "The quotient of the mean errors over all attacks gives strong attacks "
+            "more weight. In "
             f"`{mean.idxmin()}`, it is {mean.min():.2f}.",
         ),
         head=[
@@ -107,7 +108,7 @@ def _totals(drives: pd.DataFrame) -> tuple[Any, dict[Any, str]]:
 
 
 def _decisive_places(logs: Mapping[str, pd.Series], above: int) -> Iterator[str]:
-    """Yield the places without which the title would count other environments."""
+    """Yield the places without which another number of environments would count."""
     places = next(iter(logs.values())).index
     for route, seed in places if len(places) > FEWEST else ():
         count = _above({name: one.drop((route, seed)) for name, one in logs.items()})

@@ -90,9 +90,9 @@ def light(drives: pd.DataFrame) -> Finding:
         f"{of_method.get(name, 0)} attacks with `{name}`" for name in (VARY, PLAIN)
     )
     return Finding(
-        title=f"In {count} environments and lights, attacks keep "
-        f"{min(shares.values()):.2f} to {max(shares.values()):.2f} of their error, and "
-        f"`vary` helps in {helps}",
+        title=f"In {count} environments and lights, attacks with `vary` keep "
+        f"{min(shares.values()):.2f} to {max(shares.values()):.2f} of their error; "
+        f"it helps in {helps}",
         sentences=(
             "`vary` searches with light, camera and vehicle that differ from start to "
             "start. `plain` searches with those of the capture. What an attack keeps "
@@ -151,7 +151,8 @@ def _stayed(drives: pd.DataFrame, log_shares: pd.DataFrame) -> str:
     left, there = out[SURROGATE, "day"], out[where, "day"]
     stays = left & ~there
     others = math.exp(by_day[where][~stays].mean())
-    few = f"at all {left.sum()}" if stays.sum() == left.sum() else f"at {stays.sum()}"
+    is_each = 0 < stays.sum() == left.sum()
+    few = f"at all {left.sum()}" if is_each else f"at {stays.sum()}"
     return (
         f"A few places decide about a mean: with `vary`, the car leaves the lane at "
         f"{left.sum()} places in the surrogate by day. In `{where}` by day, it stays "

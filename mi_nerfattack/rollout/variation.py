@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import drjit as dr
@@ -208,6 +209,15 @@ class Varied(AbstractDynamics):
         pose_rates = [speed * slope[0], speed * slope[1], steering * slope[2]]
         other_rates = [slope[i] for i in range(3, len(slope))]
         return type(state)(*pose_rates, *other_rates, *lagging)
+
+    @cached_property
+    def has_speed(self) -> bool:
+        """See :class:`AbstractDynamics`."""
+        return self.model.has_speed
+
+    def speed_of(self, state: Any) -> Any:
+        """See :meth:`AbstractDynamics.speed_of`."""
+        return self.constants(state)[0] * self.model.speed_of(self._without_lag(state))
 
     def delays(self, count: int) -> np.ndarray | None:
         """See :meth:`AbstractDynamics.delays`."""

@@ -26,8 +26,8 @@ from mi_nerfattack.backend.arrays import rows_type, upload_rows
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Acute, Positive, checked
 
-#: Step of the controls, and slope above which a speed follows one, in SI units.
-_CONTROL_STEP, _SPEED_SLOPE = 1e-4, 1e-6
+#: Step of the controls, SI units; share of a speed that a control may change at once.
+_CONTROL_STEP, _SPEED_SHARE = 0.1, 0.01
 
 
 def state_type(size: int = 3) -> Any:
@@ -238,10 +238,11 @@ class AbstractDynamics(ABC):
             InputError: the speed follows a control at once, so a state has none.
         """
         if not self.has_speed:
+            name = getattr(self, "name", type(self).__name__)
             raise InputError(
-                f"{type(self).__name__}: its speed is a control and not in its state, "
-                "and the policy is told the speed (policy.inputs); let the speed be a "
-                "row of the state, override speed_of, or leave it out of the inputs"
+                f"{name}: a control sets its speed at once, so its state has no "
+                "speed to give to the policy; let the speed be a row of the state, or "
+                'leave "speed" out of policy.inputs'
             )
         none = dr.zeros(type(state[0]), dr.width(state))
         return self._speed_with(state, [none] * self.control_size)
@@ -255,21 +256,24 @@ class AbstractDynamics(ABC):
 
     @cached_property
     def has_speed(self) -> bool:
-        """Whether states say the speed: no control changes the speed at once.
+        """Whether states say the speed: no control changes the initial one at once.
 
-        Slip by steering does so in second order, which does not count.
+        Controls of opposite signs are compared, because slip by steering changes the
+        speed along the heading, too, equally to both sides.
         """
+        if type(self).speed_of is not AbstractDynamics.speed_of:
+            return True
         state = to_state(self.extend(np.zeros((1, 3))))
         row = dr.value_t(type(state))
         steps = _CONTROL_STEP * np.eye(self.control_size)
         ends = [
-            self._speed_with(state, [row(value) for value in sign * step])
+            self._speed_with(state, [row(value) for value in sign * step]).numpy()
             for step in steps
             for sign in (1, -1)
         ]
-        values = np.array([end.numpy() for end in ends]).reshape(-1, 2)
-        slopes = (values[:, 0] - values[:, 1]) / (2 * _CONTROL_STEP)
-        return bool((np.abs(slopes) <= _SPEED_SLOPE).all())
+        up, down = np.array(ends).reshape(-1, 2).T
+        largest = np.maximum(abs(up), abs(down))
+        return bool((abs(up - down) <= _SPEED_SHARE * largest).all())
 
     def numbered(self, first: int) -> AbstractDynamics:
         """Return this model with another number of the first drive of each batch.

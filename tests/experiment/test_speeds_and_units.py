@@ -28,6 +28,11 @@ def car(state, control):
 def forced(state, control):
     *moved, _ = car(state, control[0])
     return *moved, control[1]
+
+
+def commanded(state, control):
+    theta = state[2]
+    return control[1] * dr.cos(theta), control[1] * dr.sin(theta), control[0]
 """
 CUSTOM = """[vehicle]
 kind = "custom"
@@ -38,6 +43,13 @@ control_limit = 1.5
 rest_state = [9.0]
 """
 FORCED = CUSTOM.replace("car.py:car", "car.py:forced") + "controls = 2\n"
+COMMANDED = """[vehicle]
+kind = "custom"
+function = "car.py:commanded"
+trust_code = true
+control_limit = 9.0
+controls = 2
+"""
 
 
 @pytest.mark.parametrize(
@@ -49,6 +61,7 @@ FORCED = CUSTOM.replace("car.py:car", "car.py:forced") + "controls = 2\n"
         (CUSTOM, "length_m = 4", ["9", "5", "8", "7.2", "8", "4.0"]),
         (FORCED, "length_m = 4", ["9", "5", "8", "7.2", "8", "4.0"]),
         (CUSTOM.replace("9.0", "5.0"), "length_m = 4", []),
+        (COMMANDED, "length_m = 4", []),  # its state has no speed
     ],
 )
 def test_speeds_of_vehicle_and_route(scenario_folder, vehicle, drive, numbers):
@@ -57,7 +70,7 @@ def test_speeds_of_vehicle_and_route(scenario_folder, vehicle, drive, numbers):
     text = (scenario_folder / "scenario.toml").read_text()
     assert "horizon = 4" in text
     path = scenario_folder / "speeds.toml"
-    if vehicle == FORCED:
+    if vehicle in (FORCED, COMMANDED):
         text = text.replace("[policy]", "[policy]\noutput = [0, 1]")
     path.write_text(text.replace("horizon = 4", drive) + vehicle)
     scenario, _ = load_scenario(path)

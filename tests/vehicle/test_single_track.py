@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -12,6 +12,7 @@ from support.faults.refusals import refusals
 from support.reference.derivatives import row64, state64
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.rollout.variation import Variation, Varied
 from mi_nerfattack.vehicle import (
     RK4,
     AbstractDynamics,
@@ -203,10 +204,36 @@ def test_speed_as_control():
         return speed * dr.cos(theta), speed * dr.sin(theta), steering
 
     model = FunctionDynamics(kinematic, controls=2)
-    assert not model.has_speed
-    with pytest.raises(InputError, match="speed is a control and not in its state"):
-        model.speed_of(state64([[0.0], [0.0], [0.3]]))
-    assert ROLLING.has_speed and SLIPPING.has_speed and Dubins(5.0).has_speed
+    varied = Varied(model, Variation(speed_sd=0.1, steering_lag_s_sd=0.1), 0.1)
+    for vehicle in (model, varied):
+        assert not vehicle.has_speed
+        with pytest.raises(InputError, match=r"FunctionDynamics.*policy\.inputs"):
+            vehicle.speed_of(state64(vehicle.extend(np.zeros(3)).T))
+    for vehicle in (Dubins(5.0), KinematicBicycle(4.0, 1.1, 1.4, 1.2), ROLLING):
+        assert vehicle.has_speed
+
+
+@dataclass(frozen=True)
+class Commanded(AbstractDynamics):
+    """Vehicle whose author says which speed its states have."""
+
+    def derivative(self, state, control):
+        return type(state)(control * dr.cos(state[2]), control * dr.sin(state[2]), 0)
+
+    def saturate(self, control):
+        return control
+
+    def speed_of(self, state):
+        return type(state[0])(3.0)
+
+
+def test_a_speed_of_its_own():
+    """Counts, also for a vehicle that varies."""
+    variation = Variation(speed_sd=0.2, seed=1)
+    vehicle = Varied(Commanded(), variation, 0.1)
+    assert vehicle.has_speed and Commanded().has_speed
+    speed = vehicle.speed_of(state64(np.zeros((3, 4)))).numpy()
+    np.testing.assert_allclose(speed, 3 * variation.draws(0, 4).speed)
 
 
 def test_vehicles_start_at_their_speed():
