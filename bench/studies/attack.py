@@ -19,6 +19,7 @@ from bench.studies.content import (
     geometric_interval,
     interval_words,
     metres,
+    share_words,
 )
 from mi_nerfattack.drives.table import records
 from mi_nerfattack.evaluation.pairs import Effect, compare
@@ -98,12 +99,11 @@ def attack(drives: pd.DataFrame) -> Finding:
             f"worst random texture {effect.other:.3f} m (ratio {effect.ratio:.1f}, "
             f"{interval_words(effect.ratio_ci95, 1)}).",
             f"The attack is farther at {places} (share: "
-            f"{interval_words(share_interval(count, effect.attacks), 2)}). The ratio "
-            f"has a geometric mean of {ratio:.1f} over the places "
-            f"({interval_words(ratio_ends, 1)}). At {out} of {effect.attacks} places, "
-            "a wheel is out of the lane for 1 s or more with the attack, on average "
-            "over the drives (share: "
-            f"{interval_words(share_interval(out, effect.attacks), 2)}).",
+            f"{share_words(count, effect.attacks)}). The ratio has a geometric mean of "
+            f"{ratio:.1f} over the places ({interval_words(ratio_ends, 1)}). At "
+            f"{out} of {effect.attacks} places, a wheel is out of the lane for 1 s or "
+            "more with the attack, on average over the drives (share: "
+            f"{share_words(out, effect.attacks)}).",
             f"The difference is {effect.difference:.2f} m on average "
             f"({interval_words(effect.difference_ci95, 2)}). Between the places of one "
             f"route, it has a standard deviation of {metres(effect.spread)}. The "

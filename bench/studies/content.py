@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from mi_nerfattack.evaluation.summary import Interval, interval
+from mi_nerfattack.evaluation.summary import Interval, interval, share_interval
 from mi_nerfattack.scenario.deployment import SURROGATE
 
 HALF = 0.5  # of the error in the surrogate, and of the places
@@ -69,6 +69,11 @@ def interval_words(ends: Interval, digits: int) -> str:
     """Return an interval as words."""
     few = "too few places for an interval"
     return few if ends is None else f"95 % interval {ends_cell(ends, digits)}"
+
+
+def share_words(count: int, places: int) -> str:
+    """Return the interval of a share of places as words."""
+    return interval_words(share_interval(count, places), 2)
 
 
 def metres(value: float | None) -> str:

@@ -27,6 +27,7 @@ from bench.studies.content import (
     ends_cell,
     interval_words,
     metres,
+    share_words,
 )
 from bench.studies.fit_quality import fit_quality
 from bench.studies.limits import limits
@@ -36,10 +37,7 @@ from bench.studies.transfer import transfer
 from bench.studies.vary import light, vary_parts
 from mi_nerfattack.drives.table import records, with_starts
 from mi_nerfattack.evaluation.pairs import compare
-from mi_nerfattack.evaluation.summary import (
-    share_interval,
-    summary,
-)
+from mi_nerfattack.evaluation.summary import summary
 from mi_nerfattack.experiment.sweep.summary import GRADIENT
 from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, RANDOM
 from mi_nerfattack.scenario.deployment import SURROGATE
@@ -214,7 +212,6 @@ def flat(drives: pd.DataFrame) -> Finding:
     shares = {name: left[c] / count[c] for c, name in CASES.items() if c in left}
     places = own[own["case"] == ATTACK].groupby("cell")["departed"].any()
     out, all_places = int(places.sum()), len(places)
-    ends = share_interval(out, all_places)
     missing = 2 * (FLAT_PLACES - all_places)  # two drives at each
     most = (left[ATTACK] + missing) / (count[ATTACK] + missing)
     lost = (
@@ -235,7 +232,7 @@ def flat(drives: pd.DataFrame) -> Finding:
             f"With the attack, {left[ATTACK]} of {count[ATTACK]} drives leave the lane "
             "in the path-traced scene, where its sun and sky light the object. "
             f"The drives that leave it are at {out} of {all_places} places (share: "
-            f"{interval_words(ends, 2)}). {_by_environment(drives)}",
+            f"{share_words(out, all_places)}). {_by_environment(drives)}",
             f"With random textures, {left[RANDOM]} of {count[RANDOM]} drives leave the "
             "lane. The attack moves the car farther than the worst random texture at "
             f"{farther} of {all_places} places (ratio of the means {effect.ratio:.2f}, "

@@ -43,47 +43,53 @@ def fit_quality(
         psnr: by method, dB; by default the mean over the routes of `FIELDS`.
     """
     where = deployment_of(drives)
-    inside, deployed = (
-        _errors(drives, environment, ATTACK) for environment in (SURROGATE, where)
+    inside, deployed, own = (
+        _by_place(drives, environment, case)
+        for environment, case in (
+            (SURROGATE, ATTACK),
+            (where, ATTACK),
+            (SURROGATE, OWN),
+        )
     )
-    own, out = _errors(drives, SURROGATE, OWN), _out(drives, where, ATTACK)
-    names, counts = list(deployed.index), _counts(drives, where)
+    out, counts = (
+        _by_place(drives, where, ATTACK, "departed", statistic)
+        for statistic in ("sum", "count")
+    )
+    names = list(deployed.index)
     psnr = {name: _psnr(name) for name in names} if psnr is None else psnr
     logs = deployed.map(math.log)
     transfer, gains = logs - inside.map(math.log), logs - logs.loc[BEST]
     ratios = {name: _mean(gains.loc[name]) for name in names if name != BEST}
-    poor = _below(gains)
+    shares = {name: _mean(transfer.loc[name]) for name in names}
     worst = min(ratios, key=lambda name: psnr[name])
     rows = [
         [
             *(f"`{name}`", f"{psnr[name]:.1f}"),
             *(f"{errors.loc[name].mean():.3f}" for errors in (own, inside, deployed)),
-            *_cells(_mean(transfer.loc[name])),
+            *_cells(shares[name]),
             *_cells(ratios.get(name)),
-            f"{out.loc[name].sum():.0f} of {counts[name]}",
+            f"{out.loc[name].sum():.0f} of {counts.loc[name].sum():.0f}",
         ]
         for name in names
     ]
-    shares = ", ".join(f"{_mean(transfer.loc[n])[0]:#.2g} (`{n}`)" for n in names)
+    listed = ", ".join(f"{share:#.2g} (`{n}`)" for n, (share, _) in shares.items())
     errors = deployed.set_axis([f"{n}, {psnr[n]:.1f} dB" for n in names])
     errors.columns = [f"{route} {seed}" for route, seed in deployed.columns]
     weaker = int((gains.loc[worst] < 0).sum())
-    has_intervals = any(ends is not None for _, ends in ratios.values())
-    listed = _listed(poor) or "none of them"
     return Finding(
-        title=_title(len(poor), len(ratios), ratios[worst][0], psnr=psnr[worst]),
+        title=_title(
+            len(_below(ratios)), len(ratios), ratios[worst][0], psnr=psnr[worst]
+        ),
         sentences=(
             "`steps_N` is the field of the scene after N steps of its fit. In the "
             f"path-traced scene, attacks from `{worst}` have {ratios[worst][0]:.2f} "
             f"times the error of attacks from `{BEST}` (geometric mean over "
             f"{deployed.shape[1]} places, {interval_words(ratios[worst][1], 2)}). They "
             f"are weaker at {weaker} places.",
-            f"Of its error in the field, an attack keeps {shares} in the path-traced "
+            f"Of its error in the field, an attack keeps {listed} in the path-traced "
             "scene. The interval of this share lies below 1 for "
-            f"{_listed(_below(transfer)) or 'none of them'}.",
-            "By the rule, a field is too poor if the interval of the ratio to "
-            f"`{BEST}` in the path-traced scene lies below 1. "
-            + (f"This holds for {listed}." if has_intervals else "None has one yet.")
+            f"{_listed(_below(shares)) or 'none of them'}.",
+            _rule(ratios)
             + " Metres are arithmetic means and ratios are geometric ones, so one "
             "large error can reverse their order.",
         ),
@@ -98,7 +104,7 @@ def fit_quality(
         draw=lambda figure: draw_searches(figure, errors),
         pandas="attacks = drives.query(\"case == 'attack'\")\n"
         'print(attacks.pivot_table("cross_track_mean_m", "method", "environment"))',
-        threats=(*_threats(out, _out(drives, SURROGATE, OWN)), *_THREATS),
+        threats=(*_threats(drives, out), *_THREATS),
     )
 
 
@@ -115,23 +121,34 @@ def _title(poor: int, fields: int, ratio: float, psnr: float) -> str:
     )
 
 
-def _below(logs: pd.DataFrame) -> list[str]:
+def _rule(ratios: Mapping[str, tuple[float, Interval]]) -> str:
+    """Say for which fields the rule of bench/fit_quality.toml holds."""
+    has_intervals = any(ends is not None for _, ends in ratios.values())
+    listed = _listed(_below(ratios)) or "none of them"
+    return (
+        f"By the rule, a field is too poor if the interval of the ratio to `{BEST}` in "
+        "the path-traced scene lies below 1. "
+        + (f"This holds for {listed}." if has_intervals else "None has one yet.")
+    )
+
+
+def _below(means: Mapping[str, tuple[float, Interval]]) -> list[str]:
     """Return the fields whose interval of a geometric mean lies below 1."""
-    ends = {str(name): _mean(own)[1] for name, own in logs.iterrows()}
-    return [name for name, one in ends.items() if one is not None and one[1] < 1]
+    return [name for name, (_, ends) in means.items() if ends and ends[1] < 1]
 
 
 def _listed(names: list[str]) -> str:
     return ", ".join(f"`{name}`" for name in names)
 
 
-def _threats(out: Any, own: Any) -> Iterator[str]:
+def _threats(drives: pd.DataFrame, out: Any) -> Iterator[str]:
     """Yield where cars leave the lane.
 
     Args:
-        out: by method and place, drives with the attack in the deployment.
-        own: as `out`, with the original textures in the field.
+        drives: all.
+        out: by method and place, drives out with the attack in the deployment.
     """
+    own = _by_place(drives, SURROGATE, OWN, "departed", "sum")
     failed = {str(name): places[places > 0] for name, places in own.iterrows()}
     for name, places in failed.items():
         if len(places):
@@ -155,23 +172,18 @@ def _threats(out: Any, own: Any) -> Iterator[str]:
         )
 
 
-def _out(drives: pd.DataFrame, environment: str, case: str) -> Any:
-    """Return the drives that leave the lane, by method and place."""
+def _by_place(
+    drives: pd.DataFrame,
+    environment: str,
+    case: str,
+    value: str = ERROR,
+    statistic: Any = "mean",
+) -> Any:
+    """Return a statistic of a column by method and place; by default the mean error."""
     own = drives[(drives["environment"] == environment) & (drives["case"] == case)]
-    where = ["route", "seed"]
-    return own.pivot_table("departed", "method", where, aggfunc="sum", sort=False)
-
-
-def _counts(drives: pd.DataFrame, environment: str) -> Any:
-    """Return the number of drives with the attack, by field."""
-    own = drives[(drives["environment"] == environment) & (drives["case"] == ATTACK)]
-    return own.groupby("method").size()
-
-
-def _errors(drives: pd.DataFrame, environment: str, case: str) -> pd.DataFrame:
-    """Return the mean error (m) by method and place."""
-    own = drives[(drives["environment"] == environment) & (drives["case"] == case)]
-    return own.pivot_table(ERROR, "method", ["route", "seed"], sort=False)
+    return own.pivot_table(
+        value, "method", ["route", "seed"], aggfunc=statistic, sort=False
+    )
 
 
 def _mean(logs: Any) -> tuple[float, Interval]:

@@ -33,8 +33,8 @@ def limits(places: pd.DataFrame) -> Finding:
     rows["farthest_m"] = rows[["up_m", "down_m"]].max(axis=1)
     rows["out"] = rows["farthest_m"] > rows["limit_m"]
     by_kind = rows.groupby("kind", observed=True)
-    by_route = rows.groupby(["kind", "route"], observed=True, sort=False)
-    weakest, moved = by_kind["out"].mean().idxmin(), _medians(by_route)
+    by_route: Any = rows.groupby(["kind", "route"], observed=True, sort=False)
+    weakest, moved = by_kind["out"].mean().idxmin(), by_route["moved"].median()
     least, most = moved[weakest].min(), moved[weakest].max()
     others = [kind for kind, _ in by_kind if kind != weakest]
     original = rows["original_m"] > rows["limit_m"]
@@ -78,11 +78,6 @@ def limits(places: pd.DataFrame) -> Finding:
         pandas='drives["kind"] = drives.place.str.split("-").str[1]\n'
         'print(drives.groupby("kind")[["moved", "up_m", "down_m"]].median())',
     )
-
-
-def _medians(by_route: Any) -> Any:
-    """Return the median reach by kind and route, rad/s."""
-    return by_route["moved"].median()
 
 
 def _range(values: Any) -> str:

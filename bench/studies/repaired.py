@@ -173,9 +173,10 @@ def _doubt(group: str, one: _Compared, where: str) -> str:
     ends = share_interval(after, one.places)
     low, high = (100 * end for end in ends or (0.0, 1.0))
     return (
-        f"Few places decide about {GROUPS[group]} attacks: in `{where}`, the car "
-        f"leaves the lane at {before} of {one.places} places with the old policy, and "
-        f"at {after} with the new one (share: 95 % interval {low:.0f} to {high:.0f} %)."
+        f"Few places decide about {GROUPS[group]} attacks. In `{where}`, the car "
+        f"leaves the lane at {before} of {one.places} places with the old policy. With "
+        f"the new one, it does so at {after} places (share: 95 % interval {low:.0f} to "
+        f"{high:.0f} %)."
     )
 
 

@@ -317,8 +317,8 @@ def test_a_policy_is_repaired_where_no_drive_leaves_the_lane():
     ]
     old, held_out, adaptive, _, routes = answer.threats
     assert "leaves the lane at 5 of 5 places with the old policy" in old
-    assert "and at 0 with the new one (share: 95 %" in held_out
-    assert "and at 5 with the new one" in adaptive
+    assert "With the new one, it does so at 0 places (share: 95 %" in held_out
+    assert "With the new one, it does so at 5 places" in adaptive
     assert routes.endswith("new attacks on the new one: left 5 and 5.")
     some = retrained(departed=True).query("group != 'adaptive'")
     assert made("repaired", some).title.endswith("near old and held-out attacks")
